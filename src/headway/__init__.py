@@ -1,0 +1,81 @@
+"""Headway: control that keeps making headway when the physics changes.
+
+    run = headway.train("pendulum", preset="quick", seed=0)
+    controller = headway.load(run.path)
+    action = controller.act(obs)
+
+Names are loaded when first used, so `import headway` is quick and brings in no simulator.
+"""
+
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from headway.api import Run as Run
+    from headway.api import evaluate as evaluate
+    from headway.api import load as load
+    from headway.api import train as train
+    from headway.config import Config as Config
+    from headway.data import ReplayBuffer as ReplayBuffer
+    from headway.data import Trajectory as Trajectory
+    from headway.errors import ConfigError as ConfigError
+    from headway.errors import DivergenceError as DivergenceError
+    from headway.errors import EnvironmentFault as EnvironmentFault
+    from headway.errors import HeadwayError as HeadwayError
+    from headway.errors import RunError as RunError
+    from headway.errors import UnknownNameError as UnknownNameError
+    from headway.experiment.methods import METHODS as METHODS
+    from headway.experiment.methods import PRESETS as PRESETS
+    from headway.experiment.methods import make_config as make_config
+    from headway.experiment.runs import EpisodeRow as EpisodeRow
+    from headway.experiment.runs import RunDir as RunDir
+    from headway.models.dynamics import MultiHeadDynamics as MultiHeadDynamics
+    from headway.planning.agent import Agent as Agent
+    from headway.planning.controller import Controller as Controller
+    from headway.planning.optimizers import CEM as CEM
+    from headway.planning.optimizers import RandomShooting as RandomShooting
+    from headway.report.dynamics import plot_dynamics as plot_dynamics
+    from headway.sim_params import SimParamSets as SimParamSets
+    from headway.tasks.base import Task as Task
+    from headway.tasks.catalog import EnvSpec as EnvSpec
+    from headway.tasks.catalog import env_spec as env_spec
+    from headway.tasks.catalog import register as register
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "api": ("Run", "evaluate", "load", "train"),
+    "config": ("Config",),
+    "data": ("ReplayBuffer", "Trajectory"),
+    "errors": (
+        "ConfigError",
+        "DivergenceError",
+        "EnvironmentFault",
+        "HeadwayError",
+        "RunError",
+        "UnknownNameError",
+    ),
+    "experiment.methods": ("METHODS", "PRESETS", "make_config"),
+    "experiment.runs": ("EpisodeRow", "RunDir"),
+    "models.dynamics": ("MultiHeadDynamics",),
+    "planning.agent": ("Agent",),
+    "planning.controller": ("Controller",),
+    "planning.optimizers": ("CEM", "RandomShooting"),
+    "report.dynamics": ("plot_dynamics",),
+    "sim_params": ("SimParamSets",),
+    "tasks.base": ("Task",),
+    "tasks.catalog": ("EnvSpec", "env_spec", "register"),
+}
+_WHERE = {name: module for module, names in _HOME.items() for name in names}
+
+__all__ = ["__version__", *sorted(_WHERE)]  # noqa: PLE0604
+
+
+def __getattr__(name: str):
+    if name not in _WHERE:
+        raise AttributeError(f"module 'headway' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"headway.{_WHERE[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -16,8 +16,21 @@ class Task(eqx.Module):
     axes. `action` is always in the environment's own units; the model and the planner work
     with actions scaled to [-1, 1] and convert with `scale_action`.
 
-    Subclasses state the sizes as class variables and override what differs from the plain
-    case: preprocess = identity, target = next_obs - obs, no termination.
+    Subclasses state the sizes as class variables (a property where an option changes one)
+    and override what differs from the plain case: preprocess = identity, target =
+    next_obs - obs, no termination. Options of an environment are fields of its Task.
+
+    Example:
+        A point pushed along a line, which should stay at zero:
+
+        >>> class LineTask(Task):
+        ...     obs_size: ClassVar[int] = 2
+        ...     action_size: ClassVar[int] = 1
+        ...     action_low: ClassVar[tuple[float, ...]] = (-1.0,)
+        ...     action_high: ClassVar[tuple[float, ...]] = (1.0,)
+        ...
+        ...     def reward(self, obs, action, next_obs):
+        ...         return -jnp.square(next_obs[..., 0])
     """
 
     obs_size: ClassVar[int]
@@ -40,7 +53,7 @@ class Task(eqx.Module):
         action: Float[Array, "*batch action"],
         next_obs: Float[Array, "*batch obs"],
     ) -> Float[Array, "*batch"]:
-        """Reward that the released code plans with; differs where it lags or errs (fact sheet G)."""
+        """Reward that the released code plans with; differs where that lags or errs."""
         return self.reward(obs, action, next_obs)
 
     def terminated(
@@ -80,6 +93,10 @@ class Task(eqx.Module):
         """Map an action from the environment's own units to [-1, 1]."""
         low, high = jnp.asarray(self.action_low), jnp.asarray(self.action_high)
         return 2.0 * (action - low) / (high - low) - 1.0
+
+    def clip_action(self, action: Float[Array, "*batch action"]) -> Float[Array, "*batch action"]:
+        """Limit an action in the environment's own units to its range, as the envs do."""
+        return jnp.clip(action, jnp.asarray(self.action_low), jnp.asarray(self.action_high))
 
     @property
     def feature_size(self) -> int:

@@ -1,0 +1,81 @@
+# Everything runs in .venv, which is made when it is missing. Installing is repeated only when
+# pyproject.toml or constraints.txt change. Other Python: make demo PYTHON=python3.12
+PYTHON ?= python3
+JOBS ?= 2
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+INSTALL := $(PIP) install -qq -c constraints.txt
+SPECS := pyproject.toml constraints.txt
+CONSTRAINED_PYTHONS ?= python3.11 python3.12
+
+# Rendering tests draw off screen, with OSMesa or EGL, whichever is installed.
+OFFSCREEN = MUJOCO_GL=$${MUJOCO_GL:-$$($(BIN)/python -c "from ctypes.util import find_library as find; \
+	print('osmesa' if find('OSMesa') else 'egl')")}
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo test test-slow lint bench docs constraints clean
+
+help: ## List the targets
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' Makefile | awk -F'|' '{ printf "make %-12s %s\n", $$1, $$2 }'
+
+demo: $(VENV)/main.stamp ## Train and evaluate T-MCL on Pendulum, in minutes
+	@$(BIN)/headway train pendulum --preset quick --seed 0 --run-dir runs/demo
+
+test: $(VENV)/test.stamp ## Run the tests; JOBS=4 runs four at a time
+	@$(OFFSCREEN) $(BIN)/python -m pytest -n $(JOBS) -m "not slow"
+
+test-slow: $(VENV)/test.stamp ## Run the tests that take minutes each
+	@$(OFFSCREEN) $(BIN)/python -m pytest -m slow
+
+lint: $(VENV)/test.stamp $(VENV)/lint.stamp ## Check style, types and import rules
+	@$(BIN)/ruff check
+	@$(BIN)/ruff format --check
+	@PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright
+	@$(BIN)/lint-imports
+
+bench: $(VENV)/test.stamp $(VENV)/bench.stamp ## Time planning, fitting and environments; wants an idle machine
+	@$(BIN)/python -m pytest benchmarks -o python_files='bench_*.py' -p no:xdist --benchmark-quiet
+
+docs: $(VENV)/test.stamp ## Check that the links in README and docs lead somewhere (there is no site yet)
+	@$(BIN)/python -m pytest tests/test_package.py -k links
+
+constraints: ## Rewrite constraints.txt from fresh installs of the newest versions
+	@for python in $(CONSTRAINED_PYTHONS); do \
+		venv=$(VENV)-constraints/$$(basename $$python) && rm -rf $$venv && echo "$$python: installing" && \
+		$$python -m venv $$venv && $$venv/bin/python -m pip install -qq --upgrade pip && \
+		$$venv/bin/python -m pip install -qq . --group test --group bench --group lint && \
+		$$venv/bin/python -m pip freeze --all --exclude headway --exclude setuptools \
+			| LC_ALL=C sort > $$venv.txt || exit 1; \
+	done
+	@cd $(VENV)-constraints && set -- $(notdir $(CONSTRAINED_PYTHONS)) && { \
+		LC_ALL=C comm -12 $$1.txt $$2.txt; \
+		LC_ALL=C comm -23 $$1.txt $$2.txt | sed 's/$$/; python_version < "3.12"/'; \
+		LC_ALL=C comm -13 $$1.txt $$2.txt | sed 's/$$/; python_version >= "3.12"/'; \
+	} | LC_ALL=C sort -f > pins.txt
+	@sed -n '/^#/p' constraints.txt | cat - $(VENV)-constraints/pins.txt > $(VENV)-constraints/new.txt
+	@mv $(VENV)-constraints/new.txt constraints.txt
+
+clean: ## Remove caches and build leftovers; keeps .venv and runs
+	@rm -rf build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks
+	@rm -rf $(VENV)-constraints benchmarks/latest.json MUJOCO_LOG.TXT
+	@find src tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# pip exists only where venv succeeded; a .venv that somebody else made is used as it is.
+$(VENV)/main.stamp: $(SPECS)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and \
+		"error: Python %d.%d is too old, allowed: 3.11 or newer; use make PYTHON=python3.11" \
+		% sys.version_info[:2])'
+	@test -x $(BIN)/pip || { echo "Creating $(VENV)"; $(PYTHON) -m venv $(VENV); }
+	@echo "Installing headway into $(VENV)"
+	@$(INSTALL) --editable .
+	@touch $@
+
+# A pip of 2025 or newer, because only that knows dependency groups.
+$(VENV)/%.stamp: $(VENV)/main.stamp
+	@echo "Installing what $* needs"
+	@$(INSTALL) --upgrade pip
+	@$(INSTALL) --group $*
+	@touch $@

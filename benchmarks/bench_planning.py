@@ -1,0 +1,70 @@
+"""One planning step at the paper's HalfCheetah size, and the memory it takes."""
+
+import itertools
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from headway.config import ModelConfig, PlannerConfig
+from headway.models.dynamics import MultiHeadDynamics, Statistics
+from headway.planning.agent import Agent, AgentState
+from headway.tasks.catalog import env_spec
+
+MODEL = ModelConfig()
+PLANNER = PlannerConfig()
+
+
+def make_agent(num_envs: int) -> tuple[Agent, AgentState, jax.Array]:
+    """An untrained agent, its state after one step, and what it sees."""
+    task = env_spec("half-cheetah").make_task()
+    model = MultiHeadDynamics.init(MODEL, task, key=jax.random.key(0))
+    statistics = Statistics.identity(task, MODEL.history_length)
+    agent = Agent(model, statistics, task, PLANNER, MODEL.history_length)
+    obs = 0.1 * jax.random.normal(jax.random.key(1), (num_envs, task.obs_size))
+    state, _ = agent.act(agent.init(num_envs, key=jax.random.key(2)), obs)
+    return agent, state, obs
+
+
+def plan_flop(agent: Agent) -> float:
+    """Floating-point operations of the matrix products of one environment's plan."""
+    *hidden, features = (agent.task.feature_size + agent.task.action_size, *MODEL.hidden_sizes)
+    sizes = (*hidden, features, 2 * agent.task.obs_size)
+    per_call = 2 * sum(n * m for n, m in itertools.pairwise(sizes))
+    imagined = PLANNER.num_candidates * PLANNER.num_particles * PLANNER.horizon
+    return float(per_call * imagined * PLANNER.num_iterations)
+
+
+@pytest.mark.parametrize("num_envs", [1, 10])
+def test_plan(num_envs, timed, report):
+    agent, state, obs = make_agent(num_envs)
+    timing = timed(lambda: agent.act(state, obs), rounds=7 if num_envs == 1 else 3)
+    flop = num_envs * plan_flop(agent)
+    report.add(f"plan, {num_envs} env", timing.seconds, "s", **timing.ratio(flop))
+
+
+def test_peak_memory_of_plan(report):
+    done = subprocess.run([sys.executable, __file__], check=True, capture_output=True, text=True)
+    before, after = (int(word) / 2**20 for word in done.stdout.split())
+    report.add("plan, 10 env, peak memory of the process", after, "GiB")
+    report.add("  of which before the plan", before, "GiB")
+
+
+def peak_kib() -> int:
+    """The largest resident set of this process so far, in KiB."""
+    status = Path("/proc/self/status")
+    if status.exists():  # getrusage would count the parent's memory too
+        (line,) = [line for line in status.read_text().splitlines() if line.startswith("VmHWM")]
+        return int(line.split()[1])
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+if __name__ == "__main__":
+    jnp.zeros(1).block_until_ready()
+    before_plan = peak_kib()
+    jax.block_until_ready(make_agent(10)[1])
+    print(before_plan, peak_kib())

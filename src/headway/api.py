@@ -1,0 +1,134 @@
+"""What most users need: train, evaluate, load."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from headway.config import Config
+from headway.errors import ConfigError, unknown_name
+from headway.experiment.evaluation import episode_rows, evaluate_agent
+from headway.experiment.methods import make_config
+from headway.experiment.progress import Progress
+from headway.experiment.rollouts import Arena
+from headway.experiment.runs import EpisodeRow, RunDir
+from headway.experiment.training import load_agent, train_run
+from headway.planning.controller import Controller
+from headway.report.figures import save_run_figures
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A trained run and what it measured."""
+
+    path: Path
+    """The run directory."""
+    config: Config
+    """All settings."""
+    metrics: list[dict[str, Any]]
+    """One entry per iteration, as in `metrics.jsonl`."""
+    evaluation: list[EpisodeRow]
+    """Every test episode, as in `evaluation.csv`."""
+    figures: list[Path]
+    """The figures made after training."""
+
+    def controller(self, *, seed: int = 0) -> Controller:
+        """The trained controller."""
+        return load(self.path, seed=seed)
+
+
+def train(
+    env: str,
+    *,
+    method: str = "tmcl",
+    preset: str = "paper",
+    seed: int = 0,
+    run_dir: str | Path | None = None,
+    settings: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> Run:
+    """Train a controller on environments whose physics vary; resume if it was begun before.
+
+    Args:
+        env: Short name or id of an environment.
+        method: A name from `headway list methods`.
+        preset: A name from `headway list presets`.
+        seed: Makes the run repeatable.
+        run_dir: Where everything is written; `runs/ENV-METHOD-PRESET-seedSEED` by default.
+        settings: Changes by dotted name, for example `{"planner.horizon": 20}`.
+        progress: Shown while training; silent by default.
+
+    Raises:
+        UnknownNameError: No such environment, method or preset.
+        ConfigError: A setting is unknown, of the wrong type or out of range.
+        RunError: The directory holds something else.
+        EnvironmentFault: The environment broke its contract.
+        DivergenceError: Fitting lost all finite numbers.
+    """
+    config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
+    run = train_run(config, run_dir or default_run_dir(config), progress)
+    figures = save_run_figures(run.path)
+    return Run(run.path, config, run.metrics(), run.evaluation(), figures)
+
+
+def evaluate(
+    run_dir: str | Path,
+    *,
+    groups: Sequence[str] | None = None,
+    num_episodes: int | None = None,
+    progress: Progress | None = None,
+) -> list[EpisodeRow]:
+    """Test a trained run once more; nothing in its directory changes.
+
+    Args:
+        run_dir: The run directory.
+        groups: `train` or unseen groups; all of them by default.
+        num_episodes: Episodes per group; the run's own number by default.
+        progress: Shown while testing; silent by default.
+
+    Raises:
+        RunError: There is no trained run, or it is damaged.
+        UnknownNameError: No such group.
+        ConfigError: `num_episodes` is less than 1.
+    """
+    run = RunDir(run_dir)
+    config = run.config()
+    agent = load_agent(run)
+    arena = Arena.make(config)
+    known = (config.sim_params or arena.spec.sim_params).group_names
+    for group in groups or ():
+        if group not in known:
+            raise unknown_name("group", group, known)
+    groups = list(dict.fromkeys(groups or known))
+    if num_episodes is not None:
+        if num_episodes < 1:
+            raise ConfigError(f"num_episodes is {num_episodes}, allowed: at least 1.")
+        testing = dataclasses.replace(config.evaluation, num_episodes=num_episodes)
+        config = dataclasses.replace(config, evaluation=testing)
+    iteration = run.finished_iterations - 1
+    with progress or Progress() as shown:
+        total = len(groups) * config.evaluation.num_episodes * arena.episode_length
+        shown.phase(iteration, run.finished_iterations, "evaluate", total)
+        key = jax.random.key(config.evaluation.seed)
+        found = evaluate_agent(agent, arena, config, groups, key=key, on_step=shown.advance)
+    return episode_rows(config, iteration, found)
+
+
+def load(run_dir: str | Path, *, seed: int = 0) -> Controller:
+    """Load the controller of a run.
+
+    Args:
+        run_dir: The run directory.
+        seed: Seeds the planner's draws.
+
+    Raises:
+        RunError: There is no trained run, or it is damaged.
+    """
+    return Controller(load_agent(RunDir(run_dir)), seed=seed)
+
+
+def default_run_dir(config: Config) -> Path:
+    """Where a run goes when no directory is named."""
+    return Path("runs") / f"{config.env}-{config.method}-{config.preset}-seed{config.seed}"

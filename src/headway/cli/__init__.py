@@ -1,0 +1,90 @@
+"""The command `headway`: parses, calls one library function, prints.
+
+Results go to stdout, progress and errors to stderr. Exit codes: 0 done, 1 an error of
+Headway's, 2 wrong usage, 130 interrupted.
+"""
+
+import os
+import sys
+from collections.abc import Sequence
+
+from headway import __version__
+from headway.cli.usage import UsageError, closest, one_line
+from headway.errors import HeadwayError
+
+HELP = """\
+usage: headway COMMAND ... [--help]
+
+Control that keeps making headway when the physics changes.
+
+commands:
+  train ENV           train a controller on an environment whose physics vary
+  evaluate RUN        test a trained run on training and unseen physics
+  list WHAT           list envs, methods or presets
+  plot-dynamics ENV   draw what an action leads to under each physics
+
+options:
+  -h, --help          show this text; `headway COMMAND --help` shows a command's options
+  --version           print the version
+
+Every command takes --json, which prints one JSON line of results on stdout.
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: The arguments; those of the process by default.
+
+    Returns:
+        The exit code.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        code = _dispatch(words)
+        sys.stdout.flush()
+        return code
+    except UsageError as error:
+        return _fail(str(error), 2)
+    except HeadwayError as error:
+        return _fail(str(error), 1)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        return _fail(_describe(error), 1)
+    except KeyboardInterrupt:
+        advice = "; the same command goes on after the last finished iteration"
+        print(f"interrupted{advice if words[:1] == ['train'] else ''}", file=sys.stderr)
+        return 130
+
+
+def _dispatch(words: list[str]) -> int:
+    if not words:
+        raise UsageError("missing command. `headway --help` lists all commands.")
+    if words[0] in ("-h", "--help", "help"):
+        print(HELP, end="")
+        return 0
+    if words[0] == "--version":
+        print(f"headway {__version__}")
+        return 0
+    from headway.cli.commands import COMMANDS
+
+    name, *rest = words
+    if name not in COMMANDS:
+        raise UsageError(
+            f"unknown command {name!r}.{closest(name, COMMANDS)} Allowed: {', '.join(COMMANDS)}."
+        )
+    return COMMANDS[name](rest)
+
+
+def _describe(error: OSError) -> str:
+    if error.filename is None:
+        return str(error)
+    return f"cannot use {error.filename}: {error.strerror}; check the path and its permissions."
+
+
+def _fail(text: str, code: int) -> int:
+    print(f"error: {one_line(text)}", file=sys.stderr)
+    return code

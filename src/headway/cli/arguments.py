@@ -1,0 +1,165 @@
+"""What each command takes. The field docstrings are the help texts."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from headway.config import (
+    CollectionConfig,
+    Config,
+    EvaluationConfig,
+    FittingConfig,
+    ModelConfig,
+    PlannerConfig,
+)
+
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
+
+
+def _unset(text: str):
+    """What help says of an option that is not given."""
+    return tyro.conf.arg(help_behavior_hint=f"(default: {text})")
+
+
+class _Unchecked:
+    """Leaves the checks to the library, which words them better than a parser can."""
+
+    def __post_init__(self):
+        pass
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelSettings(_Unchecked, ModelConfig):
+    """The dynamics model: an ensemble of multi-headed networks."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FittingSettings(_Unchecked, FittingConfig):
+    """How the model is fitted to the data after each collection."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannerSettings(_Unchecked, PlannerConfig):
+    """How actions are chosen with the model."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CollectionSettings(_Unchecked, CollectionConfig):
+    """How much data is collected."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationSettings(_Unchecked, EvaluationConfig):
+    """How controllers are tested."""
+
+
+SECTIONS = {
+    "model": ModelSettings,
+    "fitting": FittingSettings,
+    "planner": PlannerSettings,
+    "collection": CollectionSettings,
+    "evaluation": EvaluationSettings,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train a controller on an environment whose physics vary; resume if it was begun before.
+
+    The defaults shown are those of the environment, method and preset named before --help.
+    """
+
+    env: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ENV")]
+    """Short name or id of an environment; `headway list envs` shows them."""
+    method: str = "tmcl"
+    """What to train; `headway list methods` shows the choice."""
+    preset: str = "paper"
+    """At which scale; `headway list presets` shows the choice."""
+    seed: int = 0
+    """Makes the run repeatable."""
+    run_dir: Annotated[Path | None, _unset("runs/ENV-METHOD-PRESET-seedSEED")] = None
+    """Where everything is written."""
+    sim_params: Annotated[Path | None, _unset("the environment's own")] = None
+    """A JSON file with the training and unseen physics."""
+    env_options: Annotated[tuple[str, ...], _unset("those of the preset")] = ()
+    """Switches of the environment: NAME or NAME=on turns one on, NAME=off turns it off."""
+    json: Flag = False
+    """Print one JSON line on stdout instead of tables."""
+    quiet: Flag = False
+    """Show no progress."""
+    model: ModelSettings = dataclasses.field(default_factory=ModelSettings)
+    fitting: FittingSettings = dataclasses.field(default_factory=FittingSettings)
+    planner: PlannerSettings = dataclasses.field(default_factory=PlannerSettings)
+    collection: CollectionSettings = dataclasses.field(default_factory=CollectionSettings)
+    evaluation: EvaluationSettings = dataclasses.field(default_factory=EvaluationSettings)
+
+    def with_defaults(self, config: Config) -> "Train":
+        """The same arguments with the names and settings of a configuration."""
+        return dataclasses.replace(
+            self,
+            method=config.method,
+            preset=config.preset,
+            **{
+                section: cls(**dataclasses.asdict(getattr(config, section)))
+                for section, cls in SECTIONS.items()
+            },
+        )
+
+    def settings(self, default: "Train") -> dict[str, object]:
+        """The settings that differ from some defaults, by dotted name."""
+        return {
+            f"{section}.{field.name}": getattr(getattr(self, section), field.name)
+            for section, cls in SECTIONS.items()
+            for field in dataclasses.fields(cls)
+            if getattr(getattr(self, section), field.name)
+            != getattr(getattr(default, section), field.name)
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+    """Test a trained run on training and unseen physics; nothing in its directory changes."""
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """The run directory."""
+    group: Annotated[tuple[str, ...], _unset("all of them")] = ()
+    """Groups of physics: `train` or unseen groups."""
+    episodes: Annotated[int | None, _unset("as in the run's own tests")] = None
+    """Episodes per group."""
+    json: Flag = False
+    """Print one JSON line on stdout instead of tables."""
+    quiet: Flag = False
+    """Show no progress."""
+
+
+@dataclasses.dataclass(frozen=True)
+class List:
+    """List what can be named on the command line."""
+
+    what: Annotated[
+        tyro.conf.Positional[Literal["envs", "methods", "presets"]], tyro.conf.arg(metavar="WHAT")
+    ]
+    """envs, methods or presets."""
+    json: Flag = False
+    """Print one JSON line on stdout instead of a table."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PlotDynamics:
+    """Draw the next states of the same states and actions under each training physics."""
+
+    env: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ENV")]
+    """Short name or id of an environment; `headway list envs` shows them."""
+    output: Annotated[
+        Path | None,
+        tyro.conf.arg(aliases=["-o"], help_behavior_hint="(default: ENV-dynamics.png)"),
+    ] = None
+    """The PNG file to write."""
+    num_states: int = 100
+    """States of the trajectory that are drawn."""
+    seed: int = 0
+    """Seeds the trajectory and its random actions."""
+    json: Flag = False
+    """Print one JSON line on stdout instead of text."""

@@ -1,0 +1,201 @@
+"""One function per command: parse, call the library, print."""
+
+import json
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import tyro
+
+from headway.cli.arguments import Evaluate, List, PlotDynamics, Train
+from headway.cli.usage import UsageError, parse, wants_help
+from headway.errors import ConfigError, unknown_name
+
+if TYPE_CHECKING:
+    from headway.experiment.runs import EpisodeRow
+    from headway.tasks.catalog import EnvSpec
+
+PIPE_WIDTH = 130
+
+
+def train(words: Sequence[str]) -> int:
+    """`headway train`."""
+    arguments, settings = parse_train(words)
+    from headway import api
+    from headway.experiment.progress import make_progress
+
+    run = api.train(
+        arguments.env,
+        method=arguments.method,
+        preset=arguments.preset,
+        seed=arguments.seed,
+        run_dir=arguments.run_dir,
+        settings=settings,
+        progress=make_progress(arguments.quiet),
+    )
+    last = max((row.iteration for row in run.evaluation), default=0)
+    rows = [row for row in run.evaluation if row.iteration == last]
+    if arguments.json:
+        facts = {
+            "run_dir": str(run.path),
+            "env": run.config.env,
+            "method": run.config.method,
+            "preset": run.config.preset,
+            "seed": run.config.seed,
+            "iterations": len(run.metrics),
+            "timesteps": run.metrics[-1]["timesteps"],
+            **_results(rows),
+            "figures": [str(path) for path in run.figures],
+        }
+        return _print_json(facts)
+    _print_evaluation(rows, f"{run.config.env}, {run.config.method} after {last + 1} iterations")
+    for title, lines in (
+        ("Figures", [str(path) for path in run.figures]),
+        ("Test it again", [shlex.join(["headway", "evaluate", str(run.path)])]),
+        ("Resume it", [shlex.join(["headway", "train", *words])]),
+    ):
+        print(f"{title}:", *lines, sep="\n  ")
+    return 0
+
+
+def evaluate(words: Sequence[str]) -> int:
+    """`headway evaluate`."""
+    arguments = parse(Evaluate, Evaluate(run=tyro.MISSING), words, "headway evaluate")
+    from headway import api
+    from headway.experiment.progress import make_progress
+
+    rows = api.evaluate(
+        arguments.run,
+        groups=arguments.group or None,
+        num_episodes=arguments.episodes,
+        progress=make_progress(arguments.quiet),
+    )
+    if arguments.json:
+        return _print_json({"run_dir": str(arguments.run), **_results(rows)})
+    _print_evaluation(rows, f"{arguments.run}")
+    return 0
+
+
+def list_names(words: Sequence[str]) -> int:
+    """`headway list`."""
+    arguments = parse(List, List(what=tyro.MISSING), words, "headway list")
+    from headway.report import tables
+
+    found = {"envs": tables.envs, "methods": tables.methods, "presets": tables.presets}
+    entries, table = found[arguments.what]()
+    if arguments.json:
+        return _print_json({arguments.what: entries})
+    _print_tables(table)
+    return 0
+
+
+def plot_dynamics(words: Sequence[str]) -> int:
+    """`headway plot-dynamics`."""
+    default = PlotDynamics(env=tyro.MISSING)
+    arguments = parse(PlotDynamics, default, words, "headway plot-dynamics")
+    if arguments.num_states < 1:
+        raise UsageError(f"--num-states is {arguments.num_states}, allowed: at least 1.")
+    from headway.report import dynamics
+    from headway.tasks.catalog import env_spec
+
+    name = env_spec(arguments.env).name
+    out = arguments.output or Path(f"{name}-dynamics.png")
+    path = dynamics.plot_dynamics(name, out, num_states=arguments.num_states, seed=arguments.seed)
+    if arguments.json:
+        return _print_json({"env": name, "figure": str(path)})
+    print(path)
+    return 0
+
+
+COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
+    "train": train,
+    "evaluate": evaluate,
+    "list": list_names,
+    "plot-dynamics": plot_dynamics,
+}
+
+
+def parse_train(words: Sequence[str]) -> tuple[Train, dict[str, Any]]:
+    """Parse in two steps, because the defaults depend on environment, method and preset.
+
+    Returns:
+        The arguments, and every setting that differs from the preset's and method's.
+    """
+    prog = "headway train"
+    plain = Train(env=tyro.MISSING)
+    asked = [word for word in words if word not in ("-h", "--help")]
+    try:
+        first = parse(Train, plain, asked, prog)
+    except UsageError:
+        if wants_help(words):
+            parse(Train, plain, ["--help"], prog)
+        raise
+    from headway.experiment.methods import make_config
+
+    config = make_config(first.env, method=first.method, preset=first.preset)
+    default = plain.with_defaults(config)
+    if wants_help(words):
+        parse(Train, default, ["--help"], prog)
+    arguments = parse(Train, default, words, prog)
+    settings = arguments.settings(default)
+    if arguments.env_options:
+        chosen = _env_options(arguments.env, arguments.env_options)
+        settings["env_options"] = {**config.env_options, **chosen}
+    if arguments.sim_params is not None:
+        settings["sim_params"] = _read_sim_params(arguments.sim_params)
+    return arguments, settings
+
+
+def _env_options(env: str, words: Sequence[str]) -> dict[str, bool]:
+    """Read `NAME`, `NAME=on` and `NAME=off`."""
+    from headway.tasks.catalog import env_spec
+
+    spec: EnvSpec = env_spec(env)
+    values = {"": True, "on": True, "true": True, "off": False, "false": False}
+    options = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        name = name.replace("-", "_")
+        if name not in spec.options:
+            raise unknown_name(f"{spec.name} option", name, spec.options)
+        if value not in values:
+            raise UsageError(f"--env-options {name} is {value!r}, allowed: on or off.")
+        options[name] = values[value]
+    return options
+
+
+def _read_sim_params(path: Path) -> dict[str, Any]:
+    """Read a file of training and unseen physics; the library checks what it holds."""
+    try:
+        return json.loads(path.read_text())
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ConfigError(
+            f"{path} is not JSON ({error}); write training and unseen sets."
+        ) from None
+
+
+def _results(rows: "Sequence[EpisodeRow]") -> dict[str, Any]:
+    from headway.report.tables import by_group, by_physics
+
+    return {"groups": by_group(rows), "physics": by_physics(rows)}
+
+
+def _print_evaluation(rows: "Sequence[EpisodeRow]", title: str) -> None:
+    from headway.report.tables import evaluation
+
+    _print_tables(evaluation(rows, title))
+
+
+def _print_tables(*tables: Any) -> None:
+    from rich.console import Console
+
+    console = Console(width=None if sys.stdout.isatty() else PIPE_WIDTH, highlight=False)
+    for table in tables:
+        console.print(table)
+
+
+def _print_json(facts: dict[str, Any]) -> int:
+    print(json.dumps(facts, allow_nan=False))
+    return 0

@@ -1,0 +1,394 @@
+"""Every setting of a run: frozen, typed, checked, and written to JSON as it is.
+
+Defaults are the paper's (supplement A.2, A.3); where the paper is silent they follow the
+released code. A setting is addressed as `section.name`, for example `planner.horizon`.
+"""
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from headway.errors import ConfigError
+from headway.sim_params import SimParamSets
+
+Oracle = Literal["independent", "transition", "trajectory"]
+HeadSelection = Literal["adaptive", "average", "random"]
+
+
+class _Problems:
+    """Collects what is wrong with one section, so that all of it is reported at once."""
+
+    def __init__(self, section: Any):
+        self._section = section
+        self._found: list[str] = []
+
+    def at_least(self, minimum: float, *names: str) -> None:
+        for name in names:
+            value = getattr(self._section, name)
+            if not (math.isfinite(value) and value >= minimum):
+                self._found.append(f"{name} is {value}, allowed: at least {minimum}")
+
+    def between(self, low: float, high: float, *names: str) -> None:
+        for name in names:
+            value = getattr(self._section, name)
+            if not low <= value <= high:
+                self._found.append(f"{name} is {value}, allowed: {low} to {high}")
+
+    def one_of(self, name: str, allowed: tuple[str, ...]) -> None:
+        value = getattr(self._section, name)
+        if value not in allowed:
+            close = difflib.get_close_matches(str(value), allowed, n=1)
+            hint = f" (did you mean {close[0]!r}?)" if close else ""
+            self._found.append(f"{name} is {value!r}{hint}, allowed: {', '.join(allowed)}")
+
+    def sizes(self, name: str) -> None:
+        value = getattr(self._section, name)
+        if not value or any(size < 1 for size in value):
+            self._found.append(f"{name} is {value}, allowed: one or more widths of at least 1")
+
+    def require(self, condition: bool, text: str) -> None:
+        if not condition:
+            self._found.append(text)
+
+    def report(self) -> None:
+        if self._found:
+            section = type(self._section).__name__.removesuffix("Config").lower()
+            raise ConfigError(f"bad {section} settings: {'; '.join(self._found)}.")
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelConfig:
+    """The dynamics model: an ensemble of multi-headed networks (supplement A.3)."""
+
+    num_members: int = 5
+    """Networks in the ensemble."""
+    num_heads: int = 3
+    """Prediction heads of each network (H)."""
+    hidden_sizes: tuple[int, ...] = (200, 200, 200, 200)
+    """Widths of the backbone's hidden layers."""
+    context_size: int = 10
+    """Width of the learned context vector; 0 builds no context encoder."""
+    context_hidden_sizes: tuple[int, ...] = (256, 128, 64)
+    """Widths of the context encoder's hidden layers."""
+    history_length: int = 10
+    """Past transitions that enter the context encoder (K)."""
+    backward_net: bool = True
+    """Whether a second network predicts backwards in time, to shape the context (A.4)."""
+    deterministic: bool = False
+    """Whether heads predict a mean only and are fitted to the squared error."""
+
+    def __post_init__(self):
+        problems = _Problems(self)
+        problems.at_least(1, "num_members", "num_heads", "history_length")
+        problems.at_least(0, "context_size")
+        problems.sizes("hidden_sizes")
+        problems.sizes("context_hidden_sizes")
+        problems.report()
+
+
+@dataclasses.dataclass(frozen=True)
+class FittingConfig:
+    """How the model is fitted to the data after each collection (supplement A.2, A.4)."""
+
+    oracle: Oracle = "trajectory"
+    """How losses are reduced over heads once the warm-up is over."""
+    segment_length: int = 10
+    """Consecutive transitions that share a winning head (M); used by `trajectory`."""
+    warmup_iterations: int = 3
+    """First iterations, in which every head learns from all data independently."""
+    epochs: int = 50
+    """Passes over the data per iteration."""
+    batch_size: int = 256
+    """Samples per member and update."""
+    learning_rate: float = 1e-3
+    """Adam's step size."""
+    future_length: int = 5
+    """Transitions ahead that are predicted with one context (F; released code)."""
+    backward_weight: float = 0.5
+    """Weight of the backward net's loss (released code)."""
+    logvar_bound_weight: float = 0.01
+    """Pull of the learned variance bounds towards each other (PETS)."""
+    weight_decay: float = 1.0
+    """Factor on the released code's per-layer weight decay (2.5e-5 to 1e-4)."""
+    context_weight_decay: bool = True
+    """Whether the context encoder decays too; the released code forgets it."""
+    reduction: Literal["head", "segment"] = "head"
+    """Oracle loss: `head` averages within each head and sums over heads (released code);
+    `segment` is the plain average (the paper's equation 2)."""
+    bootstrap: bool = False
+    """Whether each member draws its own samples with replacement (released code, not paper)."""
+    drop_first_anchor: bool = False
+    """Whether the first anchor of every trajectory is left out (a defect of the released code)."""
+
+    def __post_init__(self):
+        problems = _Problems(self)
+        problems.at_least(1, "segment_length", "epochs", "batch_size", "future_length")
+        problems.at_least(
+            0, "warmup_iterations", "backward_weight", "logvar_bound_weight", "weight_decay"
+        )
+        problems.between(1e-12, 1.0, "learning_rate")
+        problems.one_of("oracle", typing.get_args(Oracle))
+        problems.one_of("reduction", ("head", "segment"))
+        problems.report()
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannerConfig:
+    """How actions are chosen with the model (supplement A.2; fact sheet C)."""
+
+    optimizer: Literal["cem", "random-shooting"] = "cem"
+    """What searches for the best action sequence."""
+    horizon: int = 30
+    """Imagined steps."""
+    num_candidates: int = 200
+    """Action sequences per optimizer iteration."""
+    num_elites: int = 50
+    """Best candidates that shape the next iteration (CEM)."""
+    num_iterations: int = 5
+    """Optimizer iterations per plan (CEM); random shooting draws as many candidates at once."""
+    smoothing: float = 0.1
+    """Share of the old mean and variance that is kept at each CEM iteration."""
+    initial_std: float = 0.5
+    """Standard deviation of CEM's first candidates, actions being scaled to [-1, 1]."""
+    num_particles: int = 20
+    """Imagined rollouts per candidate; a multiple of `model.num_members`."""
+    head_selection: HeadSelection = "adaptive"
+    """Which head plans: the best on recent transitions, their average, or a random one."""
+    selection_length: int = 10
+    """Past transitions on which heads compete (N)."""
+    selection_error: Literal["mean", "sampled"] = "mean"
+    """Error of the predicted mean in normalised units, or (released code) of samples in raw
+    units."""
+    selection_skips_newest: bool = False
+    """Whether the newest transition is not used to select heads (released code)."""
+    reward: Literal["task", "released"] = "task"
+    """The environment's own reward, or the one that the released code plans with."""
+
+    def __post_init__(self):
+        problems = _Problems(self)
+        problems.at_least(
+            1, "horizon", "num_candidates", "num_elites", "num_iterations", "num_particles"
+        )
+        problems.at_least(1, "selection_length")
+        problems.between(0.0, 1.0, "smoothing")
+        problems.between(1e-6, 10.0, "initial_std")
+        problems.one_of("optimizer", ("cem", "random-shooting"))
+        problems.one_of("head_selection", typing.get_args(HeadSelection))
+        problems.one_of("selection_error", ("mean", "sampled"))
+        problems.one_of("reward", ("task", "released"))
+        problems.require(
+            self.num_elites <= self.num_candidates,
+            f"num_elites is {self.num_elites}, allowed: at most num_candidates"
+            f" ({self.num_candidates})",
+        )
+        problems.require(
+            not (self.selection_skips_newest and self.selection_length == 1),
+            "selection_skips_newest leaves nothing of a selection_length of 1, allowed: 2 or more",
+        )
+        problems.report()
+
+
+@dataclasses.dataclass(frozen=True)
+class CollectionConfig:
+    """How much data is collected (supplement A.2)."""
+
+    num_iterations: int = 10
+    """Rounds of collecting and fitting; the first one acts at random."""
+    num_episodes: int = 10
+    """Episodes per iteration, all stepped and planned together."""
+    episode_length: int = 0
+    """Steps per episode; 0 takes the environment's own."""
+
+    def __post_init__(self):
+        problems = _Problems(self)
+        problems.at_least(1, "num_iterations", "num_episodes")
+        problems.at_least(0, "episode_length")
+        problems.report()
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluationConfig:
+    """How controllers are tested; test episodes have fixed seeds, the same for every method."""
+
+    every: int = 1
+    """Iterations between tests on the unseen groups; the last iteration is always tested."""
+    num_episodes: int = 10
+    """Episodes per group, spread evenly over the group's simulator parameters."""
+    training_group: Literal["last", "always"] = "last"
+    """When the training physics are tested too: after the last iteration, or at every test."""
+    seed: int = 10_000
+    """Seed of the first test episode; the others follow it."""
+
+    def __post_init__(self):
+        problems = _Problems(self)
+        problems.at_least(1, "every", "num_episodes")
+        problems.at_least(0, "seed")
+        problems.one_of("training_group", ("last", "always"))
+        problems.report()
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Everything that decides a run's numbers."""
+
+    env: str
+    """Short name of the environment."""
+    method: str = "tmcl"
+    """Name of the method the settings started from."""
+    preset: str = "paper"
+    """Name of the preset the settings started from."""
+    seed: int = 0
+    """Seeds environments, physics, initial weights, batches and planner."""
+    env_options: Mapping[str, bool] = dataclasses.field(default_factory=dict)
+    """Switches of the environment that differ from its defaults."""
+    sim_params: SimParamSets | None = None
+    """Training and unseen simulator parameters; None takes the environment's own."""
+    model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
+    """The dynamics model."""
+    fitting: FittingConfig = dataclasses.field(default_factory=FittingConfig)
+    """Fitting the model."""
+    planner: PlannerConfig = dataclasses.field(default_factory=PlannerConfig)
+    """Planning with the model."""
+    collection: CollectionConfig = dataclasses.field(default_factory=CollectionConfig)
+    """Collecting data."""
+    evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
+    """Testing."""
+
+    def __post_init__(self):
+        problems = _Problems(self)
+        problems.between(0, 2**31 - 1, "seed")
+        problems.require(
+            self.planner.num_particles % self.model.num_members == 0,
+            f"planner.num_particles is {self.planner.num_particles}, allowed: a multiple of"
+            f" model.num_members ({self.model.num_members})",
+        )
+        problems.report()
+
+
+def to_dict(config: Config) -> dict[str, Any]:
+    """Return the settings as nested dictionaries of plain values."""
+    values = dataclasses.asdict(dataclasses.replace(config, sim_params=None))
+    values["env_options"] = dict(config.env_options)
+    values["sim_params"] = config.sim_params.to_dict() if config.sim_params else None
+    return values
+
+
+def from_dict(values: Mapping[str, Any]) -> Config:
+    """Rebuild the settings that `to_dict` wrote.
+
+    Raises:
+        ConfigError: A setting is unknown, of the wrong type or out of range.
+    """
+    return _build(Config, values, prefix="")
+
+
+def override(config: Config, settings: Mapping[str, Any]) -> Config:
+    """Return `config` with some settings replaced.
+
+    Args:
+        config: The settings to start from.
+        settings: New values by dotted name, for example `{"planner.horizon": 20}`.
+
+    Raises:
+        ConfigError: A setting is unknown, of the wrong type or out of range.
+    """
+    values = to_dict(config)
+    known = setting_names(config)
+    for name, value in settings.items():
+        if name not in known:
+            raise ConfigError(unknown_setting(name, known))
+        section, _, field = name.rpartition(".")
+        (values[section] if section else values)[field] = value
+    if isinstance(values["sim_params"], SimParamSets):
+        values["sim_params"] = values["sim_params"].to_dict()
+    return from_dict(values)
+
+
+def setting_names(config: Config) -> list[str]:
+    """Return every setting's dotted name."""
+    names = []
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value) and not isinstance(value, SimParamSets):
+            names += [f"{field.name}.{inner.name}" for inner in dataclasses.fields(value)]
+        else:
+            names.append(field.name)
+    return names
+
+
+def differences(old: Config, new: Config) -> list[str]:
+    """Return one line per setting that differs, for people to read."""
+    before, after = _flatten(to_dict(old)), _flatten(to_dict(new))
+    return [
+        f"{name}: {before.get(name)} -> {after.get(name)}"
+        for name in sorted({*before, *after})
+        if before.get(name) != after.get(name)
+    ]
+
+
+def unknown_setting(name: str, known: list[str]) -> str:
+    """Word the error for an unknown setting, with the closest known one."""
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+    if not close:
+        tails = {full.rpartition(".")[2]: full for full in known}
+        close = [tails[tail] for tail in difflib.get_close_matches(name, tails, n=1)]
+    hint = f" Did you mean {close[0]!r}?" if close else ""
+    return f"unknown setting {name!r}.{hint} `headway train ENV --help` lists all settings."
+
+
+def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping) and value:
+            flat |= _flatten(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = list(value) if isinstance(value, tuple) else value
+    return flat
+
+
+def _build(cls: type, values: Any, prefix: str) -> Any:
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{prefix or 'config'} is {values!r}, allowed: a table of settings.")
+    hints = typing.get_type_hints(cls)
+    fields = [field.name for field in dataclasses.fields(cls)]
+    for name in values:
+        if name not in fields:
+            raise ConfigError(unknown_setting(f"{prefix}{name}", [prefix + f for f in fields]))
+    missing = [
+        field.name
+        for field in dataclasses.fields(cls)
+        if field.name not in values
+        and field.default is dataclasses.MISSING
+        and field.default_factory is dataclasses.MISSING
+    ]
+    if missing:
+        raise ConfigError(f"the settings lack {', '.join(prefix + name for name in missing)}.")
+    return cls(**{n: _convert(hints[n], value, f"{prefix}{n}") for n, value in values.items()})
+
+
+def _convert(hint: Any, value: Any, name: str) -> Any:
+    """Check one value against its field's type; lists become tuples, ints become floats."""
+    origin = typing.get_origin(hint)
+    if hint == SimParamSets | None:
+        return value if value is None or isinstance(value, SimParamSets) else (
+            SimParamSets.from_dict(value)
+        )
+    if dataclasses.is_dataclass(hint):
+        return value if isinstance(value, hint) else _build(hint, value, f"{name}.")
+    if origin is tuple and isinstance(value, list | tuple):
+        return tuple(_convert(int, item, name) for item in value)
+    if origin is Literal and isinstance(value, str):
+        return value
+    if origin is not None and origin is not types.UnionType and origin is not tuple:
+        if isinstance(value, Mapping) and all(isinstance(v, bool) for v in value.values()):
+            return dict(value)
+    elif hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    elif isinstance(hint, type) and type(value) is hint:
+        return value
+    wanted = getattr(hint, "__name__", str(hint)) if origin is None else str(hint)
+    raise ConfigError(f"{name} is {value!r}, allowed: {wanted.replace('typing.', '')}.")

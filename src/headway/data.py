@@ -1,0 +1,212 @@
+"""Trajectories, the replay buffer, and the views of it that a model is fitted to."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from headway.errors import ConfigError, EnvironmentFault
+
+
+@dataclasses.dataclass(frozen=True)
+class Trajectory:
+    """One episode under fixed physics.
+
+    Actions are scaled to [-1, 1]. An episode of T transitions has T + 1 observations.
+    """
+
+    obs: Float[np.ndarray, "time_plus_1 obs"]
+    action: Float[np.ndarray, "time action"]
+    reward: Float[np.ndarray, " time"]
+    sim_params: Mapping[str, float]
+    terminated: bool = False
+
+    def __post_init__(self):
+        steps = len(self.action)
+        if steps < 1 or len(self.obs) != steps + 1 or len(self.reward) != steps:
+            raise ConfigError(
+                f"a trajectory has {len(self.obs)} observations, {steps} actions and"
+                f" {len(self.reward)} rewards, allowed: T + 1, T and T with T at least 1."
+            )
+        for name in ("obs", "action", "reward"):
+            if not np.isfinite(getattr(self, name)).all():
+                step = int(np.argwhere(~np.isfinite(getattr(self, name)))[0][0])
+                raise EnvironmentFault(
+                    f"{name} at step {step} is not finite, allowed: finite numbers; check the"
+                    f" environment under sim_params {dict(self.sim_params)}."
+                )
+
+    @property
+    def returns(self) -> float:
+        """Undiscounted sum of rewards."""
+        return float(np.sum(self.reward, dtype=np.float64))
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+
+class History(NamedTuple):
+    """The last K transitions before a step, filled from the left, zeros on the right."""
+
+    obs_diff: Float[Array, "*batch K obs"]
+    action: Float[Array, "*batch K action"]
+
+
+def history_slots(step: Any, length: int, xp: Any) -> tuple[Any, Any]:
+    """Which step each slot of a history holds, and whether the slot is used.
+
+    Args:
+        step: Steps whose past is wanted, with a trailing axis of 1.
+        length: Number of slots (K).
+        xp: `numpy` or `jax.numpy`.
+    """
+    index = xp.maximum(step - length, 0) + xp.arange(length)
+    return index, index < step
+
+
+class Episodes(eqx.Module):
+    """All trajectories as padded arrays on the device; rows past `count` are empty."""
+
+    obs: Float[Array, "episode time_plus_1 obs"]
+    action: Float[Array, "episode time action"]
+    length: Int[Array, " episode"]
+    count: Int[Array, ""]
+
+    @classmethod
+    def pad(cls, trajectories: list[Trajectory], capacity: int, max_length: int) -> "Episodes":
+        """Lay trajectories out in arrays of fixed shape, repeating the last observation."""
+        first = trajectories[0]
+        obs = np.zeros((capacity, max_length + 1, first.obs.shape[1]), np.float32)
+        action = np.zeros((capacity, max_length, first.action.shape[1]), np.float32)
+        length = np.zeros(capacity, np.int32)
+        for row, trajectory in enumerate(trajectories):
+            steps = len(trajectory)
+            obs[row, : steps + 1] = trajectory.obs
+            obs[row, steps + 1 :] = trajectory.obs[-1]
+            action[row, :steps] = trajectory.action
+            length[row] = steps
+        count = jnp.asarray(len(trajectories), jnp.int32)
+        return cls(jnp.asarray(obs), jnp.asarray(action), jnp.asarray(length), count)
+
+    def history(
+        self, episode: Int[Array, "*batch"], step: Int[Array, "*batch"], length: int
+    ) -> History:
+        """Gather what the context encoder sees at given steps.
+
+        Slot j holds step j while fewer than K steps have passed, later a shifting window
+        (fact sheet B.2). State differences are raw; the newest transition is included.
+
+        Args:
+            episode: Rows of the episodes.
+            step: Steps whose past is wanted; transitions before them are used.
+            length: Number of slots (K).
+        """
+        index, used = history_slots(step[..., None], length, jnp)
+        index = jnp.minimum(index, self.action.shape[1] - 1)
+        rows = episode[..., None]
+        obs_diff = self.obs[rows, index + 1] - self.obs[rows, index]
+        return History(
+            obs_diff=jnp.where(used[..., None], obs_diff, 0.0),
+            action=jnp.where(used[..., None], self.action[rows, index], 0.0),
+        )
+
+
+class Samples(NamedTuple):
+    """Which transitions a model learns from: the context of `anchor` predicts `anchor + offset`."""
+
+    episode: Int[Array, " sample"]
+    anchor: Int[Array, " sample"]
+    offset: Int[Array, " sample"]
+    count: Int[Array, ""]
+
+    @classmethod
+    def table(
+        cls, lengths: list[int], future_length: int, capacity: int, *, drop_first: bool = False
+    ) -> "Samples":
+        """List every valid (episode, anchor, offset), padded to `capacity` rows.
+
+        Args:
+            lengths: Transitions of each episode.
+            future_length: Offsets 0 .. F-1 (F; released code, fact sheet B.4).
+            capacity: Rows of the table, at least as many as there are valid samples.
+            drop_first: Leave out anchor 0 of each episode, as the released code does.
+        """
+        rows = [np.zeros((0, 3), np.int32)]
+        for episode, length in enumerate(lengths):
+            anchor, offset = np.meshgrid(
+                np.arange(length), np.arange(future_length), indexing="ij"
+            )
+            valid = (anchor + offset < length) & (anchor >= int(drop_first))
+            triple = np.stack([np.full_like(anchor, episode), anchor, offset], axis=-1)
+            rows.append(triple[valid].astype(np.int32))
+        table = np.concatenate(rows)
+        padded = np.zeros((capacity, 3), np.int32)
+        padded[: len(table)] = table
+        columns = [jnp.asarray(padded[:, i]) for i in range(3)]
+        return cls(*columns, count=jnp.asarray(len(table), jnp.int32))
+
+
+def segment_sums(
+    values: Float[Array, "*batch time"], valid: Bool[Array, " time"], segment_length: int
+) -> Float[Array, "*batch segment"]:
+    """Sum valid values over consecutive segments; the last segment may be shorter."""
+    steps = values.shape[-1]
+    num_segments = -(-steps // segment_length)
+    padding = [(0, 0)] * (values.ndim - 1) + [(0, num_segments * segment_length - steps)]
+    kept = jnp.pad(jnp.where(valid, values, 0.0), padding)
+    return kept.reshape(*values.shape[:-1], num_segments, segment_length).sum(-1)
+
+
+class ReplayBuffer:
+    """Every trajectory collected so far; nothing is ever discarded (supplement A.2)."""
+
+    def __init__(self, obs_size: int, action_size: int):
+        self.obs_size = obs_size
+        self.action_size = action_size
+        self.trajectories: list[Trajectory] = []
+
+    def add(self, trajectory: Trajectory) -> None:
+        """Append one trajectory.
+
+        Raises:
+            EnvironmentFault: Its observations or actions are of another width.
+        """
+        got = (trajectory.obs.shape[1], trajectory.action.shape[1])
+        if got != (self.obs_size, self.action_size):
+            raise EnvironmentFault(
+                f"a trajectory has observations and actions of widths {got}, allowed:"
+                f" {(self.obs_size, self.action_size)}, as its Task says."
+            )
+        self.trajectories.append(trajectory)
+
+    @property
+    def num_transitions(self) -> int:
+        """Transitions held."""
+        return sum(len(trajectory) for trajectory in self.trajectories)
+
+    def __len__(self) -> int:
+        return len(self.trajectories)
+
+
+def history_action_moments(
+    trajectories: list[Trajectory], length: int
+) -> tuple[Float[np.ndarray, "K action"], Float[np.ndarray, "K action"]]:
+    """Mean and standard deviation of each history slot's actions, padding included.
+
+    The zeros of an episode's first steps count, as in the released code (fact sheet B.3).
+    """
+    total = squares = count = 0.0
+    for trajectory in trajectories:
+        index, used = history_slots(np.arange(len(trajectory))[:, None], length, np)
+        clipped = np.minimum(index, len(trajectory) - 1)
+        taken = trajectory.action[clipped].astype(np.float64)
+        action = np.where(used[..., None], taken, 0.0)
+        total = total + action.sum(0)
+        squares = squares + (action**2).sum(0)
+        count += len(trajectory)
+    mean = np.asarray(total / count)
+    return mean, np.sqrt(np.maximum(squares / count - mean**2, 0.0))

@@ -1,0 +1,278 @@
+"""Many environments stepped at once, each with its own physics."""
+
+import abc
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import gymnasium
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from headway.envs.world import SimParams, World, read_options
+from headway.errors import ConfigError
+from headway.sim_params import SimParamSets
+
+Seeds = int | Sequence[int | None] | None
+
+
+class Outcome(NamedTuple):
+    """What a step returned for some of the environments."""
+
+    reward: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+
+
+class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """What all vector environments share: seeds, resets, the time limit, finished episodes.
+
+    `reset` takes as seed an integer (environment i gets seed + i), one seed per environment,
+    or None, and these options, all of which may be left out:
+
+    - `"sim_params"`: for each named parameter one value, or one per environment; parameters
+      that are not named are drawn from the training values;
+    - `"reset_mask"`: which environments are reset; the others go on as they are.
+
+    With `AutoresetMode.NEXT_STEP` the step after the end of an episode ignores its action,
+    starts the next episode with physics drawn from the training values, and pays 0. With
+    `AutoresetMode.DISABLED` an environment goes on stepping until it is reset.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def __init__(
+        self,
+        num_envs: int,
+        spaces: tuple[gymnasium.Space, gymnasium.Space],
+        autoreset_mode: AutoresetMode | str,
+        episode_length: int | None,
+    ):
+        if num_envs < 1 or (episode_length is not None and episode_length < 1):
+            raise ConfigError(
+                f"num_envs is {num_envs} and episode_length {episode_length}, allowed: at least 1."
+            )
+        mode = AutoresetMode(autoreset_mode)
+        if mode is AutoresetMode.SAME_STEP:
+            raise ConfigError("autoreset_mode is SAME_STEP, allowed: NEXT_STEP or DISABLED.")
+        self.num_envs = num_envs
+        self.single_observation_space, self.single_action_space = spaces
+        self.observation_space = batch_space(spaces[0], num_envs)
+        self.action_space = batch_space(spaces[1], num_envs)
+        self.autoreset_mode = mode
+        self.metadata = self.metadata | {"autoreset_mode": mode}  # pyright: ignore[reportAttributeAccessIssue]
+        self.episode_length = episode_length
+        self._elapsed = np.zeros(num_envs, int)
+        self._finished = np.zeros(num_envs, bool)
+        self._sim_params: dict[str, np.ndarray] = {}
+
+    def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, *, seed: Seeds = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start episodes in all environments, or in those of the mask.
+
+        Raises:
+            ConfigError: A seed, option, parameter or value is not allowed.
+        """
+        options = read_options(options, ("sim_params", "reset_mask"))
+        seeds = self._read_seeds(seed)
+        requested = self._read_sim_params(options["sim_params"])
+        chosen = np.flatnonzero(self._read_mask(options.get("reset_mask")))
+        self._start(chosen, seeds, requested)
+        return self._observe(), self._info()
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Make one step in each environment.
+
+        Raises:
+            ConfigError: Actions have the wrong shape or are not finite.
+            EnvironmentFault: A simulation diverged.
+        """
+        actions = self._check_actions(actions)
+        rewards = np.zeros(self.num_envs)
+        terminated, truncated = np.zeros((2, self.num_envs), bool)
+        restart = self._finished & (self.autoreset_mode is AutoresetMode.NEXT_STEP)
+        if restart.any():
+            nothing = [{}] * self.num_envs
+            self._start(np.flatnonzero(restart), [None] * self.num_envs, nothing)
+        active = np.flatnonzero(~restart)
+        if active.size:
+            outcome = self._advance(active, actions)
+            self._elapsed[active] += 1
+            rewards[active], terminated[active], truncated[active] = outcome
+            if self.episode_length is not None:
+                truncated[active] |= self._elapsed[active] >= self.episode_length
+        self._finished = terminated | truncated
+        return self._observe(), rewards, terminated, truncated, self._info()
+
+    @property
+    def sim_params(self) -> dict[str, np.ndarray]:
+        """The simulator parameters now in force, one value per environment."""
+        return {name: values.copy() for name, values in self._sim_params.items()}
+
+    def _info(self) -> dict[str, Any]:
+        return {"sim_params": self.sim_params}
+
+    def _start(
+        self, chosen: np.ndarray, seeds: Sequence[int | None], requested: Sequence[SimParams]
+    ) -> None:
+        for i in chosen:
+            values = self._begin(int(i), seeds[i], requested[i])
+            for name, value in values.items():
+                self._sim_params.setdefault(name, np.full(self.num_envs, np.nan))[i] = value
+        self._elapsed[chosen] = 0
+        self._finished[chosen] = False
+
+    def _read_seeds(self, seed: Seeds) -> list[int | None]:
+        if seed is None or isinstance(seed, int | np.integer):
+            return [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ConfigError(
+                f"seed has {len(seed)} entries, allowed: an int, or {self.num_envs} of them."
+            )
+        return [None if one is None else int(one) for one in seed]
+
+    def _read_sim_params(self, values: Mapping[str, Any]) -> list[SimParams]:
+        """Turn values per parameter into parameters per environment."""
+        rows: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for name, column in values.items():
+            column = np.asarray(column)
+            if column.shape not in ((), (self.num_envs,)):
+                raise ConfigError(
+                    f"sim_params {name} has shape {column.shape}, allowed: one value, or"
+                    f" {self.num_envs}, one per environment."
+                )
+            for row, value in zip(rows, np.broadcast_to(column, self.num_envs), strict=True):
+                row[name] = value.item()
+        return [self._check_sim_params(row) for row in rows]
+
+    def _read_mask(self, mask: Any) -> np.ndarray:
+        mask = np.ones(self.num_envs, bool) if mask is None else np.asarray(mask)
+        if mask.shape != (self.num_envs,) or mask.dtype != bool:
+            raise ConfigError(
+                f"reset_mask has shape {mask.shape} and dtype {mask.dtype}, allowed:"
+                f" {self.num_envs} booleans."
+            )
+        return mask
+
+    def _check_actions(self, actions: np.ndarray) -> np.ndarray:
+        return actions
+
+    def _check_sim_params(self, values: dict[str, Any]) -> SimParams:
+        return values
+
+    @abc.abstractmethod
+    def _begin(self, i: int, seed: int | None, requested: SimParams) -> SimParams:
+        """Start an episode in environment `i` and return its simulator parameters."""
+
+    @abc.abstractmethod
+    def _advance(self, active: np.ndarray, actions: np.ndarray) -> Outcome:
+        """Step the environments of the given indices; `actions` has a row for each of all."""
+
+    @abc.abstractmethod
+    def _observe(self) -> np.ndarray:
+        """Return all observations, in an array of their own."""
+
+
+class WorldVectorEnv(HeadwayVectorEnv):
+    """Many copies of one world."""
+
+    def __init__(
+        self,
+        world: World,
+        num_envs: int,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        episode_length: int | None = None,
+    ):
+        spaces = world.observation_space, world.action_space
+        length = world.catalog_entry.episode_length if episode_length is None else episode_length
+        super().__init__(num_envs, spaces, autoreset_mode, length)
+        self._world = world
+        self._rngs: list[np.random.Generator | None] = [None] * num_envs
+        self._sim_params = {
+            name: np.full(num_envs, float(value))
+            for name, value in world.catalog_entry.default_sim_params.items()
+        }
+
+    def _check_actions(self, actions: np.ndarray) -> np.ndarray:
+        return self._world.clip(actions, (self.num_envs, self._world.task.action_size))
+
+    def _check_sim_params(self, values: dict[str, Any]) -> SimParams:
+        return self._world.check(values)
+
+    def _begin(self, i: int, seed: int | None, requested: SimParams) -> SimParams:
+        rng = self._rngs[i]
+        if rng is None or seed is not None:
+            rng = self._rngs[i] = seeding.np_random(seed)[0]
+        self._set_initial_state(i, rng)
+        sim_params = self._world.draw(rng, requested)
+        self._apply_sim_params(i, sim_params)
+        return sim_params
+
+    @abc.abstractmethod
+    def _set_initial_state(self, i: int, rng: np.random.Generator) -> None:
+        """Put environment `i` into the state that an episode starts in."""
+
+    def _apply_sim_params(self, i: int, sim_params: SimParams) -> None:
+        """Change the physics of environment `i`; nothing to do where they are read."""
+
+
+class SequentialVectorEnv(HeadwayVectorEnv):
+    """Any Gymnasium environments, stepped one after the other.
+
+    For environments of your own: they must take `options={"sim_params": {name: value}}` in
+    `reset`, end no step with NaN, and share their spaces.
+
+    Args:
+        env_fns: Make the environments.
+        sim_params: Draws the parameters that `reset` is not told; None leaves that to the
+            environments, which must then return them in `info["sim_params"]`.
+        autoreset_mode: What happens after the end of an episode.
+        episode_length: Steps after which an episode is cut; None leaves it to the environments.
+    """
+
+    def __init__(
+        self,
+        env_fns: Sequence[Callable[[], gymnasium.Env]],
+        *,
+        sim_params: SimParamSets | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        episode_length: int | None = None,
+    ):
+        self.envs = [make() for make in env_fns]
+        if not self.envs:
+            raise ConfigError("env_fns is empty, allowed: at least one.")
+        spaces = self.envs[0].observation_space, self.envs[0].action_space
+        super().__init__(len(self.envs), spaces, autoreset_mode, episode_length)
+        self._sets = sim_params
+        self._rngs = [seeding.np_random()[0] for _ in self.envs]
+        self._obs: list[Any] = [np.zeros(spaces[0].shape or ()) for _ in self.envs]
+
+    def _begin(self, i: int, seed: int | None, requested: SimParams) -> SimParams:
+        if self._sets is not None:
+            if seed is not None:
+                self._rngs[i] = seeding.np_random(seed)[0]
+            requested = self._sets.sample(self._rngs[i]) | requested
+        options = {"sim_params": requested} if requested else None
+        self._obs[i], info = self.envs[i].reset(seed=seed, options=options)
+        return requested | info.get("sim_params", {})
+
+    def _advance(self, active: np.ndarray, actions: np.ndarray) -> Outcome:
+        rewards, terminated, truncated = [], [], []
+        for i in active:
+            self._obs[i], reward, ends, cut, _ = self.envs[i].step(actions[i])
+            rewards.append(float(reward))
+            terminated.append(bool(ends))
+            truncated.append(bool(cut))
+        return Outcome(np.array(rewards), np.array(terminated), np.array(truncated))
+
+    def _observe(self) -> np.ndarray:
+        return np.stack(self._obs)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the environments."""
+        for env in self.envs:
+            env.close()

@@ -1,0 +1,101 @@
+"""What a trained model has learned: head shares per physics, error by imagined step."""
+
+from collections import defaultdict
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from headway.data import Episodes, Trajectory
+from headway.experiment.runs import format_sim_params
+from headway.models.fitting import FitSetup, assign_segments
+from headway.planning.agent import Agent, choose_heads, encode, planning_heads
+from headway.planning.heads import RecentTransitions
+from headway.planning.returns import ImaginedDynamics
+
+NUM_STARTS = 256  # imagined rollouts per group in `prediction_error`
+
+
+def head_shares(
+    agent: Agent, setup: FitSetup, trajectories: list[Trajectory], episodes: Episodes
+) -> list[dict[str, Any]]:
+    """Share of the segments of each physics that each head of each member owns.
+
+    Returns:
+        Rows of `assignments.csv`, without the iteration.
+    """
+    assignment = eqx.filter_jit(assign_segments)(agent.model, setup, episodes, agent.statistics)
+    heads = np.asarray(assignment.forward)
+    owned = defaultdict(lambda: np.zeros((agent.model.num_members, agent.model.num_heads)))
+    for row, trajectory in enumerate(trajectories):
+        used = -(-len(trajectory) // setup.segment_length)
+        for head in range(agent.model.num_heads):
+            count = (heads[:, row, :used] == head).sum(-1)
+            owned[format_sim_params(trajectory.sim_params)][:, head] += count
+    return [
+        {"member": member, "head": head, "sim_params": physics, "share": float(share)}
+        for physics, counts in sorted(owned.items())
+        for (member, head), share in np.ndenumerate(counts / counts.sum(-1, keepdims=True))
+    ]
+
+
+def prediction_error(
+    agent: Agent, trajectories: list[Trajectory], *, key: PRNGKeyArray
+) -> Float[np.ndarray, " step"]:
+    """Root mean squared error of imagined observations by step, over one planning horizon.
+
+    From evenly spread moments of real episodes the chosen heads predict, without noise, what
+    the episode's own actions lead to. Errors are in units of each dimension's standard
+    deviation over these episodes; members are averaged over.
+    """
+    horizon = agent.planner.horizon
+    slots = max(agent.history_length, agent.planner.selection_length)
+    starts = [(t, s) for t in trajectories for s in range(slots, len(t) - horizon + 1)]
+    starts = [starts[i] for i in np.unique(np.linspace(0, len(starts) - 1, NUM_STARTS, dtype=int))
+              ] if starts else []  # fmt: skip
+    if not starts:
+        return np.zeros(0)
+    std = np.concatenate([t.obs for t in trajectories]).std(0)
+
+    def cut(before: int, after: int, shift: int, name: str):
+        return jnp.asarray([getattr(t, name)[s - before + shift : s + after + shift] for t, s in starts])
+
+    recent = RecentTransitions(
+        cut(slots, 0, 0, "obs"),
+        cut(slots, 0, 0, "action"),
+        cut(slots, 0, 1, "obs"),
+        jnp.full(len(starts), slots, jnp.int32),
+    )
+    truth = cut(0, horizon, 1, "obs")
+    imagined = _imagine(agent, recent, cut(0, horizon, 0, "action"), key)
+    scaled = (np.asarray(imagined) - np.asarray(truth)) / np.where(std > 1e-6, std, np.inf)
+    return np.sqrt(np.square(scaled).mean((0, 1, 3)))
+
+
+@eqx.filter_jit
+def _imagine(
+    agent: Agent,
+    recent: RecentTransitions,
+    actions: Float[Array, "env horizon action"],
+    key: PRNGKeyArray,
+) -> Float[Array, "member env horizon obs"]:
+    """Mean prediction of every member along given actions, from many moments at once."""
+    head_key, error_key = jax.random.split(key)
+    context = encode(agent, recent)
+    heads = choose_heads(agent, recent, context, error_key=error_key, head_key=head_key)
+    folded = planning_heads(agent, heads)
+    dynamics = ImaginedDynamics.fold(agent.model, agent.statistics, folded, context)
+    members = agent.model.num_members
+
+    def step(obs, action):
+        action = jnp.broadcast_to(action[None, :, None], (*obs.shape[:-1], action.shape[-1]))
+        x = jnp.concatenate([agent.task.preprocess(obs), action], axis=-1)
+        obs = agent.task.postprocess(obs, dynamics.sample_delta(x, None))
+        return obs, obs[:, :, 0]
+
+    start = jnp.broadcast_to(recent.next_obs[:, -1][None, :, None], (members, len(actions), 1, agent.task.obs_size))
+    _, imagined = jax.lax.scan(step, start, actions.transpose(1, 0, 2))
+    return imagined.transpose(1, 2, 0, 3)

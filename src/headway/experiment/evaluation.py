@@ -1,0 +1,95 @@
+"""Testing a controller on training and unseen physics (fact sheet D.2)."""
+
+from collections.abc import Callable, Sequence
+
+import jax
+from jaxtyping import PRNGKeyArray
+
+from headway.config import Config
+from headway.data import Trajectory
+from headway.experiment.rollouts import Episode, Arena, agent_policy, run_episodes
+from headway.experiment.runs import EpisodeRow
+from headway.planning.agent import Agent
+from headway.sim_params import SimParamSets
+
+GROUP_SEEDS = 1000  # seeds reserved for each group, so that groups never share an episode
+
+
+def group_episodes(
+    sim_params: SimParamSets, group: str, num_episodes: int, first_seed: int
+) -> list[Episode]:
+    """The test episodes of a group: fixed, distinct seeds, physics spread evenly.
+
+    Args:
+        sim_params: The run's simulator parameters.
+        group: `train` or an unseen group.
+        num_episodes: How many.
+        first_seed: Where the seeds of the first group begin.
+
+    Raises:
+        UnknownNameError: No such group.
+    """
+    physics = sim_params.group(group)
+    first = first_seed + GROUP_SEEDS * list(sim_params.group_names).index(group)
+    return [Episode(physics[i % len(physics)], first + i) for i in range(num_episodes)]
+
+
+def evaluate_agent(
+    agent: Agent,
+    arena: Arena,
+    config: Config,
+    groups: Sequence[str],
+    *,
+    key: PRNGKeyArray,
+    on_step: Callable[[int], None] = lambda steps: None,
+) -> dict[str, list[Trajectory]]:
+    """Run the test episodes of some groups, as many side by side as the batch holds.
+
+    Args:
+        agent: The agent to test.
+        arena: The environments.
+        config: Settings of the run.
+        groups: `train` or unseen groups.
+        key: The planner's draws.
+        on_step: Called after each step with the number of environments that stepped.
+
+    Returns:
+        The trajectories of each group, in the order of their episodes.
+    """
+    sim_params = config.sim_params or arena.spec.sim_params
+    evaluation = config.evaluation
+    episodes = [
+        (group, episode)
+        for group in groups
+        for episode in group_episodes(sim_params, group, evaluation.num_episodes, evaluation.seed)
+    ]
+    found: dict[str, list[Trajectory]] = {group: [] for group in groups}
+    size = arena.vector.num_envs
+    for chunk, start in enumerate(range(0, len(episodes), size)):
+        batch = episodes[start : start + size]
+        policy = agent_policy(agent, size, key=jax.random.fold_in(key, chunk))
+        rollout = run_episodes(arena, [episode for _, episode in batch], policy, on_step)
+        for (group, _), trajectory in zip(batch, rollout.trajectories, strict=True):
+            found[group].append(trajectory)
+    return found
+
+
+def episode_rows(
+    config: Config, iteration: int, trajectories: dict[str, list[Trajectory]]
+) -> list[EpisodeRow]:
+    """Turn test episodes into rows of `evaluation.csv`."""
+    return [
+        EpisodeRow(
+            config.method,
+            config.env,
+            config.seed,
+            iteration,
+            group,
+            trajectory.sim_params,
+            episode,
+            trajectory.returns,
+            len(trajectory),
+        )
+        for group, found in trajectories.items()
+        for episode, trajectory in enumerate(found)
+    ]

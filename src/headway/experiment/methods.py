@@ -1,0 +1,182 @@
+"""The table of methods and presets: named settings, not classes.
+
+A configuration starts from the paper's defaults, takes the preset's settings, then the
+method's, then the user's.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from headway.config import Config, override
+from headway.errors import ConfigError, unknown_name
+from headway.tasks.catalog import EnvSpec, env_spec
+
+Settings = Mapping[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """A way of learning and planning, as differences from T-MCL."""
+
+    name: str
+    description: str
+    settings: Settings
+
+
+@dataclasses.dataclass(frozen=True)
+class Preset:
+    """A scale of experiment; `settings` may depend on the environment."""
+
+    name: str
+    description: str
+    settings: Callable[[EnvSpec], Settings]
+
+
+_NO_CONTEXT: Settings = {"model.context_size": 0, "model.backward_net": False}
+
+_METHODS = (
+    Method("tmcl", "trajectory-wise multiple choice learning (the paper's method)", {}),
+    Method(
+        "mcl",
+        "multiple choice learning: heads compete for single transitions (Fig. 13)",
+        {"fitting.oracle": "transition"},
+    ),
+    Method(
+        "pets",
+        "ensemble of single-headed probabilistic networks, no context (Chua et al., 2018)",
+        {
+            **_NO_CONTEXT,
+            "model.num_heads": 1,
+            "fitting.oracle": "independent",
+            "fitting.future_length": 1,
+        },
+    ),
+    Method(
+        "mh-pets",
+        "PETS with several heads that all learn from all data; plans with their average (Fig. 10)",
+        {
+            **_NO_CONTEXT,
+            "fitting.oracle": "independent",
+            "fitting.future_length": 1,
+            "planner.head_selection": "average",
+        },
+    ),
+    Method(
+        "vanilla",
+        "one deterministic network",
+        {
+            **_NO_CONTEXT,
+            "model.num_members": 1,
+            "model.num_heads": 1,
+            "model.deterministic": True,
+            "fitting.oracle": "independent",
+            "fitting.future_length": 1,
+            "planner.num_particles": 1,
+        },
+    ),
+)
+
+
+def _paper(spec: EnvSpec) -> Settings:
+    return {"fitting.epochs": spec.epochs}
+
+
+def _released_code(spec: EnvSpec) -> Settings:
+    options = {"observe_average_velocity": False}
+    return {
+        "env_options": {name: options[name] for name in options if name in spec.options},
+        "fitting.bootstrap": True,
+        "fitting.drop_first_anchor": True,
+        "fitting.context_weight_decay": False,
+        "planner.selection_error": "sampled",
+        "planner.selection_skips_newest": True,
+        "planner.reward": "released",
+    }
+
+
+def _quick(spec: EnvSpec) -> Settings:
+    return {
+        "collection.num_iterations": 5,
+        "collection.num_episodes": 5,
+        "collection.episode_length": min(spec.episode_length, 200),
+        "fitting.epochs": 20,
+        "fitting.warmup_iterations": 2,
+        "planner.horizon": 20,
+        "planner.num_candidates": 100,
+        "planner.num_elites": 20,
+        "planner.num_iterations": 3,
+        "planner.num_particles": 5,
+        "evaluation.every": 5,
+        "evaluation.num_episodes": 8,
+    }
+
+
+def _smoke(spec: EnvSpec) -> Settings:
+    del spec
+    return {
+        "model.num_members": 2,
+        "model.hidden_sizes": (16, 16),
+        "model.context_hidden_sizes": (16,),
+        "collection.num_iterations": 2,
+        "collection.num_episodes": 2,
+        "collection.episode_length": 20,
+        "fitting.epochs": 2,
+        "fitting.batch_size": 32,
+        "fitting.warmup_iterations": 1,
+        "planner.horizon": 4,
+        "planner.num_candidates": 16,
+        "planner.num_elites": 4,
+        "planner.num_iterations": 2,
+        "planner.num_particles": 2,
+        "evaluation.num_episodes": 2,
+    }
+
+
+_PRESETS = (
+    Preset("paper", "the supplement's numbers; hours on a GPU, days on a CPU", _paper),
+    Preset("quick", "a reduced planner and schedule; minutes on a laptop", _quick),
+    Preset("smoke", "tiny sizes that only show that everything runs; seconds", _smoke),
+    Preset(
+        "released-code",
+        "the paper's numbers with every choice of the released code that differs from the paper",
+        _released_code,
+    ),
+)
+
+METHODS: dict[str, Method] = {method.name: method for method in _METHODS}
+PRESETS: dict[str, Preset] = {preset.name: preset for preset in _PRESETS}
+
+
+def make_config(
+    env: str,
+    *,
+    method: str = "tmcl",
+    preset: str = "paper",
+    seed: int = 0,
+    settings: Settings | None = None,
+) -> Config:
+    """Resolve a configuration.
+
+    Args:
+        env: Short name or id of the environment.
+        method: A name in `METHODS`.
+        preset: A name in `PRESETS`.
+        seed: Seeds everything.
+        settings: Changes by dotted name, for example `{"planner.horizon": 20}`.
+
+    Raises:
+        UnknownNameError: No such environment, method or preset.
+        ConfigError: A setting is unknown, of the wrong type or out of range.
+    """
+    spec = env_spec(env)
+    for kind, name, table in (("method", method, METHODS), ("preset", preset, PRESETS)):
+        if name not in table:
+            raise unknown_name(kind, name, table)
+    named = {**PRESETS[preset].settings(spec), **METHODS[method].settings}
+    start = Config(env=spec.name, method=method, preset=preset)
+    config = override(start, {**named, "seed": seed, **(settings or {})})
+    for option in config.env_options:
+        if option not in spec.options:
+            raise ConfigError(str(unknown_name(f"{spec.name} option", option, spec.options)))
+    return config

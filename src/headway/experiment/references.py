@@ -1,0 +1,58 @@
+"""Returns of random actions and of the paper's planner on the true dynamics.
+
+They normalise returns: score = (return - random) / (ceiling - random). Source: the
+project's fact sheet, section I, measured with 16 (Pendulum) and 12 (CartPoleSwingUp) full
+episodes per value. CartPoleSwingUp's ceiling is no upper bound for heavy poles.
+"""
+
+from collections.abc import Mapping
+
+_PENDULUM = {  # length: (random, ceiling), 200 steps
+    0.25: (-1748.0, -539.0),
+    0.375: (-1622.0, -239.0),
+    0.5: (-1501.0, -126.0),
+    0.75: (-1271.0, -107.0),
+    1.0: (-1143.0, -131.0),
+    1.25: (-1110.0, -170.0),
+    1.5: (-1041.0, -203.0),
+    1.75: (-1000.0, -240.0),
+}
+
+_CARTPOLE_SWINGUP = {  # mass scale: (random, ceiling), 500 steps
+    0.1: (215.0, 489.0),
+    0.2: (183.0, 484.0),
+    0.3: (146.0, 481.0),
+    0.5: (89.0, 462.0),
+    1.0: (33.0, 347.0),
+    1.5: (22.0, 233.0),
+    2.5: (16.0, 135.0),
+    3.0: (14.0, 105.0),
+}
+
+_TABLES = {
+    "pendulum": ("length", 200, _PENDULUM),
+    "cartpole-swingup": ("mass_scale", 500, _CARTPOLE_SWINGUP),
+}
+
+
+def score(
+    env: str, sim_params: Mapping[str, float], episode_return: float, length: int
+) -> float | None:
+    """Normalise the return of one full episode: 0 is random, 1 the true dynamics.
+
+    Args:
+        env: Short name of the environment.
+        sim_params: The episode's simulator parameters.
+        episode_return: Sum of rewards.
+        length: Steps of the episode.
+
+    Returns:
+        The score, or None where no reference is known for these physics and this length.
+    """
+    if env not in _TABLES:
+        return None
+    name, full_length, table = _TABLES[env]
+    if length != full_length or sim_params.get(name) not in table:
+        return None
+    random, ceiling = table[sim_params[name]]
+    return (episode_return - random) / (ceiling - random)

@@ -1,0 +1,314 @@
+"""The training loop: collect, fit, evaluate, save, and again (supplement A.2; fact sheet D)."""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from headway.config import Config
+from headway.data import Episodes, ReplayBuffer, Samples, Trajectory
+from headway.errors import DivergenceError, RunError
+from headway.experiment import storage
+from headway.experiment.diagnostics import head_shares, prediction_error
+from headway.experiment.evaluation import episode_rows, evaluate_agent
+from headway.experiment.progress import Progress
+from headway.experiment.rollouts import Episode, Arena, agent_policy, random_policy, run_episodes
+from headway.experiment.runs import RunDir
+from headway.models.dynamics import MultiHeadDynamics, Statistics
+from headway.models.fitting import FitSetup, FitState, fit_epoch, make_data
+from headway.planning.agent import Agent
+from headway.tasks.base import Task
+from headway.tasks.catalog import env_spec
+
+
+class Learned(NamedTuple):
+    """What a checkpoint holds."""
+
+    fit: FitState
+    statistics: Statistics
+
+
+class Keys(NamedTuple):
+    """The random streams of one iteration, derived from the seed and the iteration alone."""
+
+    collect: PRNGKeyArray
+    fit: PRNGKeyArray
+    evaluate: PRNGKeyArray
+    diagnose: PRNGKeyArray
+
+    @classmethod
+    def of(cls, seed: int, iteration: int) -> "Keys":
+        """Independent of how often the run was interrupted before."""
+        return cls(*jax.random.split(jax.random.fold_in(jax.random.key(seed), iteration + 1), 4))
+
+
+@dataclasses.dataclass
+class Trainer:
+    """A run in progress: what is fixed, what is learned, what was collected."""
+
+    config: Config
+    run: RunDir
+    arena: Arena
+    setup: FitSetup
+    learned: Learned
+    buffer: ReplayBuffer
+    progress: Progress
+
+    @classmethod
+    def open(cls, config: Config, run: RunDir, progress: Progress) -> "Trainer":
+        """Begin a run, or go on with the one in the directory.
+
+        Raises:
+            RunError: The directory holds another run, or a damaged one.
+            EnvironmentFault: The environment does not fit its Task.
+        """
+        arena = Arena.make(config)
+        run.create_or_resume(config)
+        setup = FitSetup(arena.task, config.fitting, config.model.history_length)
+        buffer = ReplayBuffer(arena.task.obs_size, arena.task.action_size)
+        for trajectory in run.load_data():
+            buffer.add(trajectory)
+        finished = run.finished_iterations
+        learned = initial(config, arena.task) if finished == 0 else load_learned(run, config)
+        return cls(config, run, arena, setup, learned, buffer, progress)
+
+    @property
+    def agent(self) -> Agent:
+        """The agent as learned so far."""
+        return make_agent(self.config, self.arena.task, self.learned)
+
+    def phase(self, iteration: int, name: str, total: int) -> None:
+        """Announce what comes next."""
+        self.progress.phase(iteration, self.config.collection.num_iterations, name, total)
+
+    def run_iteration(self, iteration: int) -> None:
+        """Collect, fit, evaluate and save; only the last write makes it count."""
+        keys = Keys.of(self.config.seed, iteration)
+        clock = [time.perf_counter()]
+        collected, failures = self.collect(iteration, keys.collect)
+        clock.append(time.perf_counter())
+        fitting = self.fit(iteration, keys.fit)
+        clock.append(time.perf_counter())
+        tested = self.evaluate(iteration, keys.evaluate)
+        clock.append(time.perf_counter())
+        metrics = {
+            "iteration": iteration,
+            "timesteps": self.buffer.num_transitions,
+            "collection": {**_summary(collected), "planner_failures": failures},
+            "fitting": fitting,
+            "evaluation": {group: _summary(found) for group, found in tested.items()},
+            "seconds": {
+                name: round(clock[i + 1] - clock[i], 3)
+                for i, name in enumerate(("collect", "fit", "evaluate"))
+            },
+        }
+        self.save(iteration, collected, tested, metrics, keys.diagnose)
+        self.progress.iteration_done(metrics)
+
+    def collect(self, iteration: int, key: PRNGKeyArray) -> tuple[list[Trajectory], int]:
+        """Run one episode in each environment, under physics drawn from the training set."""
+        config, arena = self.config, self.arena
+        rng = np.random.default_rng([config.seed, iteration])
+        sim_params = config.sim_params or arena.spec.sim_params
+        num_episodes = config.collection.num_episodes
+        seeds = rng.integers(2**31 - 1, size=num_episodes)
+        episodes = [Episode(sim_params.sample(rng), int(seed)) for seed in seeds]
+        if iteration == 0:
+            policy = random_policy(arena, rng)
+        else:
+            policy = agent_policy(self.agent, num_episodes, key=key)
+        self.phase(iteration, "collect", num_episodes * arena.episode_length)
+        rollout = run_episodes(arena, episodes, policy, self.progress.advance)
+        for trajectory in rollout.trajectories:
+            self.buffer.add(trajectory)
+        return rollout.trajectories, rollout.planner_failures
+
+    def episodes(self) -> Episodes:
+        """Everything collected, in arrays that have the same shape all through the run."""
+        size = self.config.collection
+        capacity = size.num_iterations * size.num_episodes
+        return Episodes.pad(self.buffer.trajectories, capacity, self.arena.episode_length)
+
+    def fit(self, iteration: int, key: PRNGKeyArray) -> dict[str, Any]:
+        """Renew the statistics and go through the data `epochs` times.
+
+        Raises:
+            DivergenceError: No update of an epoch had finite numbers.
+        """
+        config, fitting = self.config, self.config.fitting
+        lengths = [len(trajectory) for trajectory in self.buffer.trajectories]
+        size = config.collection
+        capacity = size.num_iterations * size.num_episodes * self.arena.episode_length
+        samples = Samples.table(
+            lengths,
+            fitting.future_length,
+            capacity * fitting.future_length,
+            drop_first=fitting.drop_first_anchor,
+        )
+        statistics = Statistics.fit(
+            self.arena.task, self.buffer.trajectories, config.model.history_length
+        )
+        data_key, epoch_key = jax.random.split(key)
+        members = config.model.num_members
+        data = make_data(
+            self.episodes(), samples, statistics, fitting, num_members=members, key=data_key
+        )
+        independent = (
+            iteration < fitting.warmup_iterations
+            or fitting.oracle == "independent"
+            or config.model.num_heads == 1
+        )
+        self.phase(iteration, "fit", fitting.epochs)
+        state, stats, skipped, updates = self.learned.fit, None, 0, 0
+        for epoch in range(fitting.epochs):
+            one_key = jax.random.fold_in(epoch_key, epoch)
+            state, stats = fit_epoch(state, self.setup, data, independent=independent, key=one_key)
+            stats = jax.device_get(stats)
+            skipped, updates = skipped + int(stats.skipped), updates + int(stats.updates)
+            if stats.skipped == stats.updates:
+                raise DivergenceError(
+                    f"no update of epoch {epoch} of iteration {iteration} had a finite loss and"
+                    " gradient; try a smaller fitting.learning_rate."
+                )
+            self.progress.advance(1, loss=float(stats.loss))
+        self.learned = Learned(state, statistics)
+        return {
+            "loss": float(stats.loss),
+            "forward_loss": float(stats.forward_loss),
+            "updates": updates,
+            "skipped_updates": skipped,
+            "transitions": sum(lengths),
+        }
+
+    def evaluate(self, iteration: int, key: PRNGKeyArray) -> dict[str, list[Trajectory]]:
+        """Test on the unseen groups, and on the training physics when the settings say so."""
+        config, evaluation = self.config, self.config.evaluation
+        last = iteration == config.collection.num_iterations - 1
+        if not last and (iteration + 1) % evaluation.every:
+            return {}
+        train, *unseen = (config.sim_params or self.arena.spec.sim_params).group_names
+        with_train = last or evaluation.training_group == "always"
+        groups = [train, *unseen] if with_train else unseen
+        total = len(groups) * evaluation.num_episodes * self.arena.episode_length
+        self.phase(iteration, "evaluate", total)
+        return evaluate_agent(
+            self.agent, self.arena, config, groups, key=key, on_step=self.progress.advance
+        )
+
+    def save(
+        self,
+        iteration: int,
+        collected: list[Trajectory],
+        tested: dict[str, list[Trajectory]],
+        metrics: dict[str, Any],
+        key: PRNGKeyArray,
+    ) -> None:
+        """Write everything of a finished iteration; the metrics come last."""
+        run, config = self.run, self.config
+        run.save_data(iteration, collected)
+        storage.save_tree(run.checkpoint(iteration), self.learned)
+        run.write_evaluation(run.evaluation() + episode_rows(config, iteration, tested))
+        shares = head_shares(self.agent, self.setup, self.buffer.trajectories, self.episodes())
+        numbered = [{"iteration": iteration, **row} for row in shares]
+        run.write_assignments(run.assignments() + numbered)
+        errors = [
+            {"iteration": iteration, "group": group, "step": step + 1, "error": float(error)}
+            for group, found in tested.items()
+            for step, error in enumerate(prediction_error(self.agent, found, key=key))
+        ]
+        run.write_prediction_errors(run.prediction_errors() + errors)
+        run.write_metrics([*run.metrics(), metrics])
+        write_tensorboard(run.path, metrics)
+        run.checkpoint(iteration - 2).unlink(missing_ok=True)
+
+
+def train_run(config: Config, run_dir: str | Path, progress: Progress | None = None) -> RunDir:
+    """Train until the last iteration, from wherever the run stands.
+
+    Args:
+        config: All settings.
+        run_dir: A new directory, or one with the same settings.
+        progress: Shown while training; silent by default.
+    """
+    with progress or Progress() as shown:
+        trainer = Trainer.open(config, RunDir(run_dir), shown)
+        for iteration in range(trainer.run.finished_iterations, config.collection.num_iterations):
+            trainer.run_iteration(iteration)
+    return trainer.run
+
+
+def make_agent(config: Config, task: Task, learned: Learned) -> Agent:
+    """Join what was learned with the planner's settings."""
+    return Agent(
+        learned.fit.model, learned.statistics, task, config.planner, config.model.history_length
+    )
+
+
+def initial(config: Config, task: Task) -> Learned:
+    """The untrained networks of a seed."""
+    setup = FitSetup(task, config.fitting, config.model.history_length)
+    key = jax.random.fold_in(jax.random.key(config.seed), 0)
+    model = MultiHeadDynamics.init(config.model, task, key=key)
+    return Learned(setup.init(model), Statistics.identity(task, config.model.history_length))
+
+
+def load_learned(run: RunDir, config: Config) -> Learned:
+    """Read the newest checkpoint of a run.
+
+    Raises:
+        RunError: No iteration is finished yet, or the checkpoint is damaged.
+    """
+    finished = run.finished_iterations
+    if finished == 0:
+        raise RunError(
+            f"{run.path} has no finished iteration yet; go on training it with the same"
+            " `headway train` command."
+        )
+    task = load_task(config)
+    template = eqx.filter_eval_shape(lambda: initial(config, task))
+    return storage.load_tree(run.checkpoint(finished - 1), template)
+
+
+def load_agent(run: RunDir) -> Agent:
+    """The agent of a run, as trained so far.
+
+    Raises:
+        RunError: There is no run, it has no finished iteration, or it is damaged.
+    """
+    config = run.config()
+    return make_agent(config, load_task(config), load_learned(run, config))
+
+
+def load_task(config: Config) -> Task:
+    """The Task of a configuration, with its environment's options."""
+    spec = env_spec(config.env)
+    return spec.make_task(**{**spec.options, **config.env_options})
+
+
+def write_tensorboard(path: Path, metrics: dict[str, Any]) -> None:
+    """Add one iteration's numbers to the TensorBoard log, over environment steps."""
+    from tensorboardX import SummaryWriter
+
+    with SummaryWriter(str(path / "tensorboard"), write_to_disk=True) as writer:
+        for section in ("collection", "fitting", "evaluation", "seconds"):
+            for name, value in metrics[section].items():
+                number = value["return_mean"] if isinstance(value, dict) else value
+                if isinstance(number, int | float):
+                    writer.add_scalar(f"{section}/{name}", number, metrics["timesteps"])
+
+
+def _summary(trajectories: list[Trajectory]) -> dict[str, Any]:
+    returns = np.array([trajectory.returns for trajectory in trajectories])
+    return {
+        "returns": returns.tolist(),
+        "return_mean": float(returns.mean()),
+        "return_std": float(returns.std()),
+        "return_min": float(returns.min()),
+        "return_max": float(returns.max()),
+        "episodes": len(returns),
+    }

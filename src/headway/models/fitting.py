@@ -1,0 +1,305 @@
+"""Fitting a model to the replay buffer: epochs on the device, one Adam step per batch.
+
+Supplement A.2 and A.4; fact sheet B.6 and B.7. Heads are assigned once per epoch over the
+whole data set, then forward and backward losses are minimised in mini-batches.
+"""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from headway.config import FittingConfig
+from headway.data import Episodes, History, Samples, segment_sums
+from headway.models.compilation import jit_networks
+from headway.models.dynamics import GaussianNet, MultiHeadDynamics, Statistics, network_input
+from headway.models.losses import (
+    assign_heads,
+    independent_loss,
+    logvar_bound_loss,
+    model_decay_loss,
+    negative_log_likelihood,
+    oracle_loss,
+)
+from headway.tasks.base import Task
+
+
+class FitState(eqx.Module):
+    """What fitting changes: the networks and Adam's moments, which persist over iterations."""
+
+    model: MultiHeadDynamics
+    optimizer: optax.OptState
+
+
+class Batch(NamedTuple):
+    """Samples of every member; leading axes [member, sample]."""
+
+    obs: Float[Array, "member sample obs"]
+    action: Float[Array, "member sample action"]
+    next_obs: Float[Array, "member sample obs"]
+    history: History
+    weight: Float[Array, "member sample"]
+
+
+class HeadLosses(NamedTuple):
+    """NLL of every head on every sample, forwards and backwards in time."""
+
+    forward: Float[Array, "member head sample"]
+    backward: Float[Array, "member head sample"] | None
+
+
+class Assignment(NamedTuple):
+    """The winning head per member and segment (or sample), for each direction."""
+
+    forward: Int[Array, "member *segment"]
+    backward: Int[Array, "member *segment"] | None
+
+
+class EpochStats(NamedTuple):
+    """Averages over the updates of one epoch."""
+
+    loss: Float[Array, ""]
+    forward_loss: Float[Array, ""]
+    skipped: Int[Array, ""]
+    updates: Int[Array, ""]
+
+
+class FitData(NamedTuple):
+    """What an epoch reads; stays on the device while fitting."""
+
+    episodes: Episodes
+    samples: Samples
+    rows: Int[Array, "member sample"]
+    statistics: Statistics
+
+
+class FitSetup(eqx.Module):
+    """What fixes the compiled epoch: the task and the settings."""
+
+    task: Task
+    config: FittingConfig = eqx.field(static=True)
+    history_length: int = eqx.field(static=True)
+
+    @property
+    def optimizer(self) -> optax.GradientTransformation:
+        """Adam as in the supplement, A.2."""
+        return optax.adam(self.config.learning_rate)
+
+    @property
+    def segment_length(self) -> int:
+        """M: transitions that share a winning head; 1 for the transition-wise oracle."""
+        return self.config.segment_length if self.config.oracle == "trajectory" else 1
+
+    def init(self, model: MultiHeadDynamics) -> FitState:
+        """Start fitting a new model."""
+        return FitState(model, self.optimizer.init(model))
+
+
+def head_losses(
+    model: MultiHeadDynamics, task: Task, statistics: Statistics, batch: Batch
+) -> HeadLosses:
+    """Loss of every head on every sample, with the context of the sample's history."""
+    context = model.context(batch.history, statistics)
+
+    def losses(net: GaussianNet, start, end, delta) -> Float[Array, "member head sample"]:
+        x = network_input(task, statistics, start, batch.action)
+        target = delta.normalize(task.target(start, end))
+        return negative_log_likelihood(net(x, context), target[:, None])
+
+    forward = losses(model.forward_net, batch.obs, batch.next_obs, statistics.delta)
+    if model.backward_net is None:
+        return HeadLosses(forward, None)
+    backward = losses(model.backward_net, batch.next_obs, batch.obs, statistics.backward_delta)
+    return HeadLosses(forward, backward)
+
+
+def total_loss(
+    model: MultiHeadDynamics,
+    losses: HeadLosses,
+    assignment: Assignment | None,
+    weight: Float[Array, "member sample"],
+    config: FittingConfig,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """What is minimised (fact sheet B.5.3), and the forward prediction loss in it.
+
+    Args:
+        model: For its variance bounds and weights.
+        losses: Loss of every head on every sample.
+        assignment: The head that owns each sample; None trains all heads on all samples.
+        weight: 1 for a sample, 0 for padding.
+        config: Weights of the terms.
+    """
+
+    def reduce(direction, owner):
+        if owner is None:
+            return independent_loss(direction, weight)
+        return oracle_loss(direction, owner, weight, config.reduction)
+
+    bound = config.logvar_bound_weight
+    forward = reduce(losses.forward, assignment and assignment.forward)
+    loss = forward + bound * logvar_bound_loss(model.forward_net)
+    if losses.backward is not None and model.backward_net is not None:
+        backward = reduce(losses.backward, assignment and assignment.backward)
+        backward = backward + bound * logvar_bound_loss(model.backward_net)
+        loss = loss + config.backward_weight * backward
+    decay = model_decay_loss(model, context=config.context_weight_decay)
+    return loss + config.weight_decay * decay, forward
+
+
+def assign_segments(
+    model: MultiHeadDynamics, setup: FitSetup, episodes: Episodes, statistics: Statistics
+) -> Assignment:
+    """Find the winning head of every segment of every episode (fact sheet B.6).
+
+    Each transition is predicted with its own context; forward and backward heads are chosen
+    independently. Segments past an episode's end hold head 0 and are never used.
+
+    Returns:
+        Heads, [member, episode, segment].
+    """
+    members, steps = model.num_members, episodes.action.shape[1]
+    num_segments = -(-steps // setup.segment_length)
+    time = jnp.arange(steps)
+
+    def assign_episode(episode: Int[Array, ""]) -> Assignment:
+        obs, action = episodes.obs[episode], episodes.action[episode]
+        past = episodes.history(jnp.full_like(time, episode), time, setup.history_length)
+        batch = Batch(obs[:-1], action, obs[1:], past, jnp.ones(steps))
+        batch = jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *x.shape)), batch)
+        losses = head_losses(model, setup.task, statistics, batch)
+        valid = time < episodes.length[episode]
+        return Assignment(*(x if x is None else winners(x, valid) for x in losses))
+
+    def winners(losses: Float[Array, "member head time"], valid: Bool[Array, " time"]):
+        return assign_heads(segment_sums(losses, valid, setup.segment_length))
+
+    def write(episode, assignment):
+        found = assign_episode(episode)
+        return jax.tree.map(lambda all_, one: all_.at[:, episode].set(one), assignment, found)
+
+    empty = jnp.zeros((members, len(episodes.length), num_segments), jnp.int32)
+    start = Assignment(empty, None if model.backward_net is None else empty)
+    return jax.lax.fori_loop(0, episodes.count, write, start)
+
+
+def gather_batch(
+    data: FitData,
+    assignment: Assignment | None,
+    order: Int[Array, "member sample"],
+    weight: Float[Array, "member sample"],
+    setup: FitSetup,
+) -> tuple[Batch, Assignment | None]:
+    """Fetch the samples of one update and the heads that own them."""
+    rows = jnp.take_along_axis(data.rows, order, axis=1)
+    episode, anchor = data.samples.episode[rows], data.samples.anchor[rows]
+    step = anchor + data.samples.offset[rows]
+    episodes = data.episodes
+
+    batch = Batch(
+        obs=episodes.obs[episode, step],
+        action=episodes.action[episode, step],
+        next_obs=episodes.obs[episode, step + 1],
+        history=episodes.history(episode, anchor, setup.history_length),
+        weight=weight,
+    )
+    if assignment is None:
+        return batch, None
+    member = jnp.arange(order.shape[0])[:, None]
+    segment = anchor // setup.segment_length
+    return batch, jax.tree.map(lambda heads: heads[member, episode, segment], assignment)
+
+
+def update(
+    state: FitState, setup: FitSetup, data: FitData, batch: Batch, owners: Assignment | None
+) -> tuple[FitState, tuple[Float[Array, ""], Float[Array, ""], Bool[Array, ""]]]:
+    """Take one Adam step; a step with a non-finite loss or gradient is skipped."""
+
+    def objective(model):
+        losses = head_losses(model, setup.task, data.statistics, batch)
+        return total_loss(model, losses, owners, batch.weight, setup.config)
+
+    (loss, forward), grads = jax.value_and_grad(objective, has_aux=True)(state.model)
+    changes, optimizer = setup.optimizer.update(grads, state.optimizer, state.model)
+    stepped = FitState(optax.apply_updates(state.model, changes), optimizer)
+    finite = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(grads))
+    kept = jax.tree.map(functools.partial(jnp.where, finite), stepped, state)
+    return kept, (jnp.where(finite, loss, 0.0), jnp.where(finite, forward, 0.0), ~finite)
+
+
+@jit_networks
+def fit_epoch(
+    state: FitState, setup: FitSetup, data: FitData, *, independent: bool, key: PRNGKeyArray
+) -> tuple[FitState, EpochStats]:
+    """Assign heads, shuffle per member, and go once through the data.
+
+    Args:
+        state: Networks and optimiser.
+        setup: Task and settings.
+        data: The data set, with its normalisers.
+        independent: Train every head on all samples (warm-up, or `oracle="independent"`).
+        key: Shuffles the samples.
+    """
+    assignment = None
+    if not independent:
+        assignment = assign_segments(state.model, setup, data.episodes, data.statistics)
+    order = shuffle(data, setup.config.batch_size, key)
+    size = setup.config.batch_size
+    num_updates = -(-data.samples.count // size)
+
+    def step(i, carry):
+        state, loss, forward, skipped = carry
+        chunk = jax.lax.dynamic_slice_in_dim(order, i * size, size, axis=1)
+        weight = jnp.broadcast_to(
+            (i * size + jnp.arange(size) < data.samples.count).astype(jnp.float32), chunk.shape
+        )
+        batch, owners = gather_batch(data, assignment, chunk, weight, setup)
+        state, (one_loss, one_forward, bad) = update(state, setup, data, batch, owners)
+        return state, loss + one_loss, forward + one_forward, skipped + bad
+
+    zero = jnp.zeros(())
+    carry = state, zero, zero, jnp.zeros((), jnp.int32)
+    state, loss, forward, skipped = jax.lax.fori_loop(0, num_updates, step, carry)
+    used = jnp.maximum(num_updates - skipped, 1)
+    return state, EpochStats(loss / used, forward / used, skipped, num_updates)
+
+
+def shuffle(data: FitData, batch_size: int, key: PRNGKeyArray) -> Int[Array, "member sample"]:
+    """Permute the valid samples of each member; padding stays behind them.
+
+    The result is padded to a whole number of batches.
+    """
+    members, capacity = data.rows.shape
+    draws = jax.random.uniform(key, (members, capacity))
+    order = jnp.argsort(jnp.where(jnp.arange(capacity) < data.samples.count, draws, jnp.inf))
+    return jnp.pad(order, ((0, 0), (0, -capacity % batch_size)))
+
+
+def make_data(
+    episodes: Episodes,
+    samples: Samples,
+    statistics: Statistics,
+    config: FittingConfig,
+    *,
+    num_members: int,
+    key: PRNGKeyArray,
+) -> FitData:
+    """Bring together what an epoch reads.
+
+    Args:
+        episodes: The padded trajectories.
+        samples: The valid samples of them.
+        statistics: Normalisers fitted to the same trajectories.
+        config: With `bootstrap`, each member draws its samples with replacement, once.
+        num_members: Networks in the ensemble.
+        key: Draws the bootstrap samples.
+    """
+    shape = (num_members, len(samples.episode))
+    if config.bootstrap and num_members > 1:
+        rows = jax.random.randint(key, shape, 0, samples.count)
+    else:
+        rows = jnp.broadcast_to(jnp.arange(shape[1]), shape)
+    return FitData(episodes, samples, rows, statistics)

@@ -1,0 +1,113 @@
+"""Layers of an ensemble and the normaliser. Members are a leading axis of every array.
+
+A batched matrix product over members runs at the processor's full rate, so the member axis
+stays inside the layers; heads are folded into one product per network as well.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+
+class Normalizer(eqx.Module):
+    """Shifts and scales features to zero mean and unit variance (fact sheet B.3).
+
+    A feature that never varied has `std` 0: it is shifted but not scaled, and
+    `denormalize` gives back its mean whatever the network says.
+    """
+
+    mean: Float[Array, "*size"]
+    std: Float[Array, "*size"]
+
+    @classmethod
+    def identity(cls, *size: int) -> "Normalizer":
+        """A normaliser that changes nothing."""
+        return cls(jnp.zeros(size), jnp.ones(size))
+
+    @classmethod
+    def of_moments(cls, mean: np.ndarray, std: np.ndarray) -> "Normalizer":
+        """Build from moments computed in float64; rounding noise counts as constant."""
+        constant = std <= 1e-7 * np.maximum(np.abs(mean), 1e-12)
+        return cls(
+            jnp.asarray(mean, jnp.float32), jnp.asarray(np.where(constant, 0, std), jnp.float32)
+        )
+
+    @classmethod
+    def fit(cls, values: Float[np.ndarray, "*batch size"]) -> "Normalizer":
+        """Take mean and population standard deviation over all leading axes."""
+        flat = np.asarray(values, np.float64).reshape(-1, values.shape[-1])
+        return cls.of_moments(flat.mean(0), flat.std(0))
+
+    @property
+    def scale(self) -> Float[Array, "*size"]:
+        """What `normalize` divides by: the standard deviation, or 1 where it is 0."""
+        return jnp.where(self.std > 0, self.std + 1e-10, 1.0)
+
+    def normalize(self, values: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
+        """Scale values to zero mean and unit variance."""
+        return (values - self.mean) / self.scale
+
+    def denormalize(self, values: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
+        """Undo `normalize`."""
+        return values * self.std + self.mean
+
+
+class Dense(eqx.Module):
+    """One linear layer for every member."""
+
+    weight: Float[Array, "member in out"]
+    bias: Float[Array, "member out"]
+
+    @classmethod
+    def init(cls, num_members: int, in_size: int, out_size: int, *, key: PRNGKeyArray) -> "Dense":
+        """Draw truncated normal weights of std 1 / (2 sqrt(in)), zero biases (released code)."""
+        return cls(
+            truncated_normal(key, (num_members, in_size, out_size), in_size),
+            jnp.zeros((num_members, out_size)),
+        )
+
+    def __call__(self, x: Float[Array, "member batch in"]) -> Float[Array, "member batch out"]:
+        return x @ self.weight + self.bias[:, None, :]
+
+
+class DenseHeads(eqx.Module):
+    """One linear layer for every member and head, over shared inputs."""
+
+    weight: Float[Array, "member head in out"]
+    bias: Float[Array, "member head out"]
+
+    @classmethod
+    def init(
+        cls, num_members: int, num_heads: int, in_size: int, out_size: int, *, key: PRNGKeyArray
+    ) -> "DenseHeads":
+        """As `Dense.init`, with a head axis."""
+        shape = (num_members, num_heads, in_size, out_size)
+        return cls(
+            truncated_normal(key, shape, in_size), jnp.zeros((num_members, num_heads, out_size))
+        )
+
+    def __call__(self, x: Float[Array, "member batch in"]) -> Float[Array, "member head batch out"]:
+        members, heads, in_size, out_size = self.weight.shape
+        stacked = self.weight.transpose(0, 2, 1, 3).reshape(members, in_size, heads * out_size)
+        out = (x @ stacked).reshape(members, -1, heads, out_size)
+        return out.transpose(0, 2, 1, 3) + self.bias[:, :, None, :]
+
+
+def truncated_normal(key: PRNGKeyArray, shape: tuple[int, ...], fan_in: int) -> Array:
+    """Normal draws within two standard deviations, of std 1 / (2 sqrt(fan_in))."""
+    return jax.random.truncated_normal(key, -2.0, 2.0, shape) / (2.0 * np.sqrt(fan_in))
+
+
+def swish(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """`x * sigmoid(x)`, the backbone's activation (supplement A.3)."""
+    return jax.nn.silu(x)
+
+
+def bound_logvar(
+    logvar: Float[Array, "..."], low: Float[Array, "..."], high: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """Squeeze log-variances softly between learned bounds (PETS; fact sheet B.1)."""
+    logvar = high - jax.nn.softplus(high - logvar)
+    return low + jax.nn.softplus(logvar - low)

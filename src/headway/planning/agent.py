@@ -1,0 +1,159 @@
+"""An agent: recent history, head selection, and a planner around a dynamics model."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from headway.config import PlannerConfig
+from headway.models.dynamics import MultiHeadDynamics, Statistics
+from headway.planning.heads import RecentTransitions, head_errors, select_heads
+from headway.planning.optimizers import make_optimizer
+from headway.planning.returns import ImaginedDynamics, candidate_returns
+from headway.tasks.base import Task
+
+
+class AgentState(NamedTuple):
+    """What an agent remembers of each environment between two steps."""
+
+    recent: RecentTransitions
+    obs: Float[Array, "env obs"]
+    action: Float[Array, "env action"]
+    acted: Bool[Array, " env"]
+    guess: Float[Array, "env horizon action"]
+    key: PRNGKeyArray
+
+
+class Decision(NamedTuple):
+    """What an agent decided in one step."""
+
+    action: Float[Array, "env action"]
+    """The action to take, in [-1, 1]."""
+    heads: Int[Array, "env member"]
+    """The head each member plans with; with `average`, the one that would be adaptive."""
+    failures: Int[Array, " env"]
+    """Planner iterations without any finite return."""
+
+
+class Agent(eqx.Module):
+    """Plans for many environments at once, each with its own physics.
+
+    All arrays have a leading environment axis. The agent itself holds no state; weights are
+    leaves, so one compiled `act` serves a model through all of its training.
+    """
+
+    model: MultiHeadDynamics
+    statistics: Statistics
+    task: Task
+    planner: PlannerConfig = eqx.field(static=True)
+    history_length: int = eqx.field(static=True)
+
+    def init(self, num_envs: int, *, key: PRNGKeyArray) -> AgentState:
+        """Remember nothing yet of `num_envs` environments."""
+        slots = max(self.history_length, self.planner.selection_length)
+        action = jnp.zeros((num_envs, self.task.action_size))
+        return AgentState(
+            RecentTransitions.empty(num_envs, slots, self.task),
+            jnp.zeros((num_envs, self.task.obs_size)),
+            action,
+            jnp.zeros(num_envs, bool),
+            jnp.zeros((num_envs, self.planner.horizon, self.task.action_size)),
+            key,
+        )
+
+    def act(
+        self, state: AgentState, obs: Float[Array | np.ndarray, "env obs"]
+    ) -> tuple[AgentState, Decision]:
+        """Choose the next action of every environment (paper, section 3.3; fact sheet C)."""
+        return _act(self, state, jnp.asarray(obs, jnp.float32))
+
+
+@eqx.filter_jit
+def _act(
+    agent: Agent, state: AgentState, obs: Float[Array, "env obs"]
+) -> tuple[AgentState, Decision]:
+    key, head_key, error_key, plan_key = jax.random.split(state.key, 4)
+    # 1. Remember the transition that the last action caused.
+    recent = state.recent.push(state.obs, state.action, obs, state.acted)
+    # 2. Encode the recent past, once per member, for the whole plan.
+    context = encode(agent, recent)
+    # 3. Choose the head that best explains the recent past.
+    heads = choose_heads(agent, recent, context, error_key=error_key, head_key=head_key)
+    # 4. Imagine candidates with it, and search for the best action sequence.
+    dynamics = ImaginedDynamics.fold(
+        agent.model, agent.statistics, planning_heads(agent, heads), context
+    )
+
+    def score(candidates, key):
+        return candidate_returns(
+            dynamics,
+            agent.task,
+            obs,
+            candidates,
+            particles_per_member=agent.planner.num_particles // agent.model.num_members,
+            released_reward=agent.planner.reward == "released",
+            key=key,
+        )
+
+    plan = make_optimizer(agent.planner).optimize(score, state.guess, key=plan_key)
+    # 5. Take the first action; the rest, shifted by one step, is the next guess.
+    action = plan.actions[:, 0]
+    guess = jnp.concatenate([plan.actions[:, 1:], jnp.zeros_like(plan.actions[:, :1])], axis=1)
+    acted = jnp.ones_like(state.acted)
+    state = AgentState(recent, obs, action, acted, guess, key)
+    return state, Decision(action, heads, plan.failures)
+
+
+def encode(
+    agent: Agent, recent: RecentTransitions
+) -> Float[Array, "member env context"] | None:
+    """The context vector of every member and environment."""
+    members = agent.model.num_members
+    history = jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (members, *x.shape)), recent.history(agent.history_length)
+    )
+    return agent.model.context(history, agent.statistics)
+
+
+def choose_heads(
+    agent: Agent,
+    recent: RecentTransitions,
+    context: Float[Array, "member env context"] | None,
+    *,
+    error_key: PRNGKeyArray,
+    head_key: PRNGKeyArray,
+) -> Int[Array, "env member"]:
+    """One head per environment and member, by its error on the recent transitions."""
+    slots, used = recent.newest(agent.planner)
+    if agent.planner.head_selection == "random":
+        used = jnp.zeros_like(used)
+    sampling_key = error_key if agent.planner.selection_error == "sampled" else None
+    errors = head_errors(
+        agent.model, agent.task, agent.statistics, slots, context, sampling_key=sampling_key
+    )
+    return select_heads(errors, used, key=head_key)
+
+
+def planning_heads(
+    agent: Agent, heads: Int[Array, "env member"]
+) -> Int[Array, "env member choice"]:
+    """The heads that imagine: the chosen one, or all of them when they are averaged."""
+    if agent.planner.head_selection != "average":
+        return heads[..., None]
+    num_heads = agent.model.num_heads
+    return jnp.broadcast_to(jnp.arange(num_heads), (*heads.shape, num_heads))
+
+
+def reset_where(
+    state: AgentState, fresh: AgentState, done: Bool[Array, " env"]
+) -> AgentState:
+    """Forget everything about the environments where an episode begins anew."""
+
+    def pick(old, new):
+        return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+    kept = jax.tree.map(pick, state._replace(key=None), fresh._replace(key=None))
+    return kept._replace(key=state.key)

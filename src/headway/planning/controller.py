@@ -1,0 +1,66 @@
+"""One robot's controller: observations in, actions out, in the environment's own units."""
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from headway.errors import ConfigError
+from headway.planning.agent import Agent
+
+
+class Controller:
+    """Acts with a trained agent, one step at a time.
+
+    Args:
+        agent: The trained agent.
+        seed: Seeds the planner's draws.
+    """
+
+    def __init__(self, agent: Agent, *, seed: int = 0):
+        self.agent = agent
+        self._seed = seed
+        self._episode = -1
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past; call it when an episode begins or the physics may have changed."""
+        self._episode += 1
+        key = jax.random.fold_in(jax.random.key(self._seed), self._episode)
+        self._state = self.agent.init(1, key=key)
+        self._heads: Int[np.ndarray, " member"] | None = None
+
+    def act(self, obs: Float[np.ndarray, " obs"]) -> Float[np.ndarray, " action"]:
+        """Choose the next action.
+
+        Args:
+            obs: The observation, as the environment returned it.
+
+        Returns:
+            The action, in the environment's own units and within its bounds.
+
+        Raises:
+            ConfigError: The observation has another shape or is not finite.
+        """
+        task = self.agent.task
+        obs = np.asarray(obs)
+        if obs.shape != (task.obs_size,):
+            raise ConfigError(
+                f"obs has shape {obs.shape}, allowed: ({task.obs_size},); pass one observation as"
+                " the environment returns it."
+            )
+        if not np.isfinite(obs).all():
+            entry = int(np.argmin(np.isfinite(obs)))
+            raise ConfigError(
+                f"obs[{entry}] is {obs[entry]}, allowed: finite numbers; check the sensor."
+            )
+        self._state, decision = self.agent.act(self._state, obs[None].astype(np.float32))
+        scaled, heads = jax.device_get((decision.action[0], decision.heads[0]))
+        self._heads = heads
+        low, high = np.asarray(task.action_low), np.asarray(task.action_high)
+        action = low + 0.5 * (scaled + 1.0) * (high - low)
+        return np.clip(action, low, high).astype(np.float32)
+
+    @property
+    def heads(self) -> Int[np.ndarray, " member"] | None:
+        """The prediction head that each member plans with now; None before the first action."""
+        return self._heads

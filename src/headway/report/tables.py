@@ -1,0 +1,181 @@
+"""Tables for people, and the same facts as plain values for programs."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.table import Table
+
+from headway.experiment.methods import METHODS, PRESETS
+from headway.experiment.references import score
+from headway.experiment.runs import EpisodeRow
+from headway.report.physics import axis_label, distinct, full_label, value_label, varying
+from headway.tasks.catalog import EnvSpec, env_names, env_spec
+
+Facts = dict[str, Any]
+
+
+def by_physics(rows: Sequence[EpisodeRow]) -> list[Facts]:
+    """Summarise test episodes for each group and its simulator parameters.
+
+    Returns:
+        Group, simulator parameters, number of episodes, mean and standard deviation of the
+        return, and the mean score, which is None where no reference is known.
+    """
+    facts = []
+    for group in dict.fromkeys(row.group for row in rows):
+        for sim_params in distinct(row.sim_params for row in rows if row.group == group):
+            same = [r for r in rows if r.group == group and dict(r.sim_params) == sim_params]
+            scores = [score(r.env, r.sim_params, r.episode_return, r.length) for r in same]
+            known = [value for value in scores if value is not None]
+            facts.append(
+                {
+                    "group": group,
+                    "sim_params": sim_params,
+                    **_returns(same),
+                    "score": float(np.mean(known)) if known else None,
+                }
+            )
+    return facts
+
+
+def by_group(rows: Sequence[EpisodeRow]) -> list[Facts]:
+    """Summarise test episodes for each group.
+
+    A group's score is the mean over its physics, each counting once; it is None unless a
+    reference is known for every one of them.
+    """
+    parts = by_physics(rows)
+    facts = []
+    for group in dict.fromkeys(row.group for row in rows):
+        scores = [part["score"] for part in parts if part["group"] == group]
+        whole = None if None in scores else float(np.mean(scores))
+        facts.append(
+            {"group": group, **_returns([r for r in rows if r.group == group]), "score": whole}
+        )
+    return facts
+
+
+def evaluation(rows: Sequence[EpisodeRow], title: str) -> Table:
+    """Lay out the returns of test episodes: a line per group, then one per physics."""
+    parts, groups = by_physics(rows), by_group(rows)
+    with_score = any(part["score"] is not None for part in parts)
+    table = _table(title, "physics")
+    for name in ("episodes", "return", *["score"] * with_score):
+        table.add_column(name, justify="right")
+    names = varying([row.sim_params for row in rows]) if rows else []
+    for facts in groups:
+        group = facts["group"]
+        label = {"train": "training", "unseen": "unseen"}.get(group, f"unseen: {group}")
+        table.add_row(label, *_cells(facts, with_score), style="bold")
+        for part in parts:
+            if part["group"] == group:
+                physics = f"  {full_label(part['sim_params'], names)}"
+                table.add_row(physics, *_cells(part, with_score))
+        table.add_section()
+    if with_score:
+        table.caption = "score: 0 = random actions, 1 = the planner on the true dynamics"
+    else:
+        table.caption = "return: mean ± standard deviation over episodes"
+    return table
+
+
+def envs() -> tuple[list[Facts], Table]:
+    """Describe every environment."""
+    specs = [env_spec(name) for name in env_names()]
+    table = _table("Environments", "name", "what varies", "training", "unseen")
+    for name in ("obs", "action", "steps"):
+        table.add_column(name, justify="right")
+    table.add_column("options", overflow="fold")
+    table.columns[0].no_wrap = True
+    entries = [_env(spec) for spec in specs]
+    for spec, entry in zip(specs, entries, strict=True):
+        everything = [p for part in entry["sim_params"].values() for p in part]
+        names = varying(everything)
+        train, *unseen = (
+            ", ".join(value_label(sim_params, names) for sim_params in part)
+            for part in entry["sim_params"].values()
+        )
+        sizes = (entry["obs_size"], entry["action_size"], entry["episode_length"])
+        table.add_row(
+            spec.name,
+            axis_label(names),
+            train,
+            "\n".join(unseen),
+            *map(str, sizes),
+            "\n".join(entry["options"]) or "–",
+        )
+    return entries, table
+
+
+def methods() -> tuple[list[Facts], Table]:
+    """Describe every method."""
+    table = _table("Methods", "name", "description", "settings that differ from tmcl")
+    entries = []
+    for method in METHODS.values():
+        entries.append(
+            {
+                "name": method.name,
+                "description": method.description,
+                "settings": dict(method.settings),
+            }
+        )
+        table.add_row(method.name, method.description, _settings(method.settings))
+    return entries, table
+
+
+def presets() -> tuple[list[Facts], Table]:
+    """Describe every preset."""
+    table = _table("Presets", "name", "description")
+    entries = []
+    for preset in PRESETS.values():
+        entries.append({"name": preset.name, "description": preset.description})
+        table.add_row(preset.name, preset.description)
+    return entries, table
+
+
+def _env(spec: EnvSpec) -> Facts:
+    task = spec.make_task(**spec.options)
+    sets = spec.sim_params
+    return {
+        "name": spec.name,
+        "id": spec.env_id,
+        "description": spec.description,
+        "obs_size": task.obs_size,
+        "action_size": task.action_size,
+        "episode_length": spec.episode_length,
+        "sim_params": {
+            group: [dict(sim_params) for sim_params in sets.group(group)]
+            for group in sets.group_names
+        },
+        "options": dict(spec.options),
+    }
+
+
+def _returns(rows: Sequence[EpisodeRow]) -> Facts:
+    returns = np.array([row.episode_return for row in rows])
+    return {
+        "episodes": len(rows),
+        "return_mean": float(returns.mean()),
+        "return_std": float(returns.std()),
+    }
+
+
+def _cells(facts: Facts, with_score: bool) -> list[str]:
+    cells = [str(facts["episodes"]), f"{facts['return_mean']:,.1f} ± {facts['return_std']:,.1f}"]
+    if with_score:
+        cells.append("–" if facts["score"] is None else f"{facts['score']:.2f}")
+    return cells
+
+
+def _settings(settings: Mapping[str, Any]) -> str:
+    return "\n".join(f"{name} {value}" for name, value in settings.items()) or "–"
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(
+        *columns, title=title, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD
+    )
+    table.title_style, table.caption_style = "bold", "dim"
+    return table

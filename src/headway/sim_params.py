@@ -1,0 +1,149 @@
+"""Simulator parameters: the hidden physics of an environment, and the sets they come from."""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from headway.errors import ConfigError, unknown_name
+
+Values = Mapping[str, tuple[float, ...]]
+
+
+@dataclasses.dataclass(frozen=True)
+class SimParamSets:
+    """The physics to train on, and groups of physics kept for testing.
+
+    Values of different parameters are independent: a set stands for all their combinations.
+
+    Example:
+        >>> sets = SimParamSets({"length": (0.5, 1.0)}, {"long": {"length": (1.5,)}})
+        >>> sets.group_names
+        ('train', 'long')
+        >>> sets.group("train")
+        [{'length': 0.5}, {'length': 1.0}]
+    """
+
+    train: Values
+    """Values of each parameter during training."""
+    unseen: Mapping[str, Values] = dataclasses.field(default_factory=dict)
+    """Values of each parameter in each group of test physics, by the group's name."""
+
+    def __post_init__(self) -> None:
+        _check_values("train", self.train)
+        if not isinstance(self.unseen, Mapping):
+            raise ConfigError(
+                f"sim_params unseen is {self.unseen!r}, allowed: parameter values by group name."
+            )
+        for name, values in self.unseen.items():
+            if name == "train" or not isinstance(name, str):
+                raise ConfigError(
+                    f"sim_params unseen has a group {name!r}, allowed: names other than 'train'."
+                )
+            _check_values(f"unseen group {name!r}", values)
+            _check_same_names(name, values, self.train)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(self.train)
+
+    @property
+    def group_names(self) -> tuple[str, ...]:
+        """`"train"`, then the unseen groups."""
+        return ("train", *self.unseen)
+
+    def sample(self, rng: np.random.Generator) -> dict[str, float]:
+        """Draw each parameter uniformly and independently from its training values."""
+        return {
+            name: float(values[rng.integers(len(values))]) for name, values in self.train.items()
+        }
+
+    def group(self, name: str) -> list[dict[str, float]]:
+        """Return every combination of a group's values.
+
+        Raises:
+            UnknownNameError: There is no such group.
+        """
+        if name not in self.group_names:
+            raise unknown_name("group", name, self.group_names)
+        values = self.train if name == "train" else self.unseen[name]
+        combinations = itertools.product(*values.values())
+        return [dict(zip(values, map(float, chosen), strict=True)) for chosen in combinations]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain dictionaries and lists, ready for JSON."""
+        return {
+            "train": _to_lists(self.train),
+            "unseen": {name: _to_lists(values) for name, values in self.unseen.items()},
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "SimParamSets":
+        """Rebuild what `to_dict` wrote.
+
+        Raises:
+            ConfigError: A part is missing, unknown, of the wrong type, or no finite number.
+        """
+        if not isinstance(values, Mapping) or "train" not in values:
+            raise ConfigError(
+                f"sim_params is {values!r}, allowed: {{'train': {{name: [values]}}, 'unseen':"
+                " {group: {name: [values]}}}."
+            )
+        for key in values:
+            if key not in ("train", "unseen"):
+                raise ConfigError(
+                    str(unknown_name("sim_params key", str(key), ["train", "unseen"]))
+                )
+        unseen = values.get("unseen", {})
+        if isinstance(unseen, Mapping):
+            unseen = {name: _to_tuples(group) for name, group in unseen.items()}
+        return cls(_to_tuples(values["train"]), unseen)
+
+
+def _check_values(where: str, values: Any) -> None:
+    """Refuse anything but non-empty tuples of finite numbers by name."""
+    if not isinstance(values, Mapping) or not values:
+        raise ConfigError(
+            f"sim_params {where} is {values!r}, allowed: one or more values for each parameter."
+        )
+    for name, numbers in values.items():
+        if not isinstance(numbers, tuple) or not numbers or not all(map(_is_finite, numbers)):
+            raise ConfigError(
+                f"sim_params {where}, {name}, is {numbers!r}, allowed: one or more finite numbers."
+            )
+
+
+def _check_same_names(group: str, values: Values, train: Values) -> None:
+    """An unseen group must say the value of every parameter, and of no other."""
+    for name in values:
+        if name not in train:
+            raise ConfigError(str(unknown_name(f"parameter in group {group!r}", str(name), train)))
+    missing = [name for name in train if name not in values]
+    if missing:
+        raise ConfigError(
+            f"sim_params unseen group {group!r} lacks {', '.join(missing)}; give every parameter"
+            f" of train a value: {', '.join(train)}."
+        )
+
+
+def _is_finite(value: Any) -> bool:
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    return number and math.isfinite(value)
+
+
+def _to_lists(values: Values) -> dict[str, list[float]]:
+    return {name: [float(value) for value in numbers] for name, numbers in values.items()}
+
+
+def _to_tuples(values: Any) -> Any:
+    """Turn JSON's lists into tuples; what is no mapping of lists stays for the checks."""
+    if not isinstance(values, Mapping):
+        return values
+    return {
+        name: tuple(numbers) if isinstance(numbers, list | tuple) else numbers
+        for name, numbers in values.items()
+    }

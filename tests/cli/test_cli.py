@@ -1,0 +1,264 @@
+import dataclasses
+import json
+import subprocess
+import sys
+
+import pytest
+
+from headway import api
+from headway.cli import main
+from headway.cli.commands import parse_train
+from headway.config import override
+from headway.errors import RunError
+from headway.experiment.methods import METHODS, PRESETS, make_config
+from headway.experiment.runs import EpisodeRow
+
+
+def run(capsys, *words):
+    """Exit code, stdout and stderr of one command."""
+    try:
+        code = main(words)
+    except SystemExit as stop:
+        code = stop.code
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def episode(group, length, value, episode=0):
+    return EpisodeRow(
+        "tmcl", "pendulum", 3, 1, group, {"length": length, "mass": 1.0}, episode, value, 200
+    )
+
+
+ROWS = [
+    episode("train", 0.5, -126.0),
+    episode("train", 1.0, -131.0),
+    episode("unseen", 1.5, -1041.0),
+    episode("unseen", 1.5, -1141.0),
+]
+
+
+@pytest.fixture
+def calls(monkeypatch, tmp_path):
+    """What the command line asks of the library, which is replaced."""
+    made = []
+
+    def train(env, **asked):
+        made.append({"env": env, **asked})
+        config = make_config(env, method=asked["method"], preset=asked["preset"])
+        metrics = [{"timesteps": 100}, {"timesteps": 200}]
+        stale = dataclasses.replace(ROWS[0], iteration=0, episode_return=0.0)
+        return api.Run(tmp_path / "run", config, metrics, [stale, *ROWS], [tmp_path / "a.png"])
+
+    def evaluate(run_dir, **asked):
+        made.append({"run_dir": run_dir, **asked})
+        return ROWS
+
+    monkeypatch.setattr(api, "train", train)
+    monkeypatch.setattr(api, "evaluate", evaluate)
+    return made
+
+
+def test_top_help_and_version(capsys):
+    assert run(capsys, "--version")[1].startswith("headway ")
+    code, out, _ = run(capsys, "--help")
+    assert code == 0
+    assert all(command in out for command in ("train", "evaluate", "list", "plot-dynamics"))
+
+
+USAGE = [
+    ([], "missing command"),
+    (["trian"], "Did you mean 'train'?"),
+    (["train"], "missing argument ENV"),
+    (["train", "pendulum", "more"], "unexpected argument 'more'"),
+    (["train", "pendulum", "--planner.horizn", "3"], "Did you mean '--planner.horizon'?"),
+    (["train", "pendulum", "--hidden-sizes", "3"], "Did you mean '--model.hidden-sizes'?"),
+    (["train", "pendulum", "--planner.horizon", "x"], "is 'x', allowed: a whole number"),
+    (["train", "pendulum", "--planner.horizon"], "Missing value for argument"),
+    (["train", "pendulum", "--fitting.learning-rate=x"], "is 'x', allowed: a number"),
+    (["train", "pendulum", "--model.hidden-sizes", "8", "x"], "is '8 x', allowed: whole numbers"),
+    (["train", "pendulum", "--fitting.oracle", "trajectroy"], "Did you mean 'trajectory'?"),
+    (["evaluate"], "missing argument RUN"),
+    (["evaluate", "run", "--episodes", "many"], "is 'many', allowed: a whole number"),
+    (["list", "env"], "Did you mean 'envs'?"),
+    (["plot-dynamics", "pendulum", "--num-states", "0"], "--num-states is 0"),
+]
+
+
+@pytest.mark.parametrize(("words", "text"), USAGE)
+def test_wrong_usage_is_one_line_and_exits_2(capsys, calls, words, text):
+    code, out, err = run(capsys, *words)
+    assert (code, out) == (2, "")
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert text in err
+    assert not calls
+
+
+ERRORS = [
+    (["train", "pendulm"], "Did you mean 'pendulum'?"),
+    (["train", "pendulm", "--help"], "Did you mean 'pendulum'?"),
+    (["train", "pendulum", "--method", "tmlc"], "Did you mean 'tmcl'?"),
+    (["train", "pendulum", "--preset", "quik"], "Did you mean 'quick'?"),
+    (["train", "pendulum", "--env-options", "nothing"], "unknown pendulum option"),
+    (["train", "pendulum", "--sim-params", "missing.json"], "missing.json"),
+]
+
+
+@pytest.mark.parametrize(("words", "text"), ERRORS)
+def test_errors_are_one_line_and_exit_1(capsys, calls, words, text):
+    code, out, err = run(capsys, *words)
+    assert (code, out) == (1, "")
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert text in err
+    assert not calls
+
+
+def test_values_out_of_range_are_left_to_the_library(capsys):
+    code, out, err = run(capsys, "train", "pendulum", "--planner.num-elites", "900")
+    assert (code, out) == (1, "")
+    assert "num_elites is 900, allowed: at most num_candidates (200)" in err
+
+
+def test_errors_of_several_lines_are_joined(capsys, monkeypatch):
+    def fail(*_, **__):
+        raise RunError("two\nlines")
+
+    monkeypatch.setattr(api, "evaluate", fail)
+    assert run(capsys, "evaluate", "somewhere") == (1, "", "error: two lines\n")
+
+
+def test_evaluating_what_is_no_run(capsys, tmp_path):
+    code, out, err = run(capsys, "evaluate", str(tmp_path / "none"), "--json")
+    assert (code, out) == (1, "")
+    assert "allowed: a run directory" in err
+
+
+@pytest.mark.parametrize(("command", "advice"), [("train", "goes on after"), ("evaluate", "")])
+def test_ctrl_c_exits_130_with_one_line(capsys, monkeypatch, command, advice):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(api, command, interrupt)
+    code, out, err = run(capsys, command, "pendulum")
+    assert (code, out) == (130, "")
+    assert err.count("\n") == 1
+    assert advice in err
+
+
+def test_settings_are_those_that_differ_from_the_preset():
+    words = (
+        "pendulum --preset quick --planner.horizon 7 --fitting.epochs 20 --model.hidden_sizes 8 9"
+    )
+    arguments, settings = parse_train(words.split())
+    assert (arguments.env, arguments.preset) == ("pendulum", "quick")
+    assert settings == {"planner.horizon": 7, "model.hidden_sizes": (8, 9)}
+
+
+def test_flags_and_options_may_come_before_the_environment():
+    words = "--model.no-backward-net --seed 4 --method=mcl pendulum --fitting.learning-rate=0.01"
+    arguments, settings = parse_train(words.split())
+    assert (arguments.env, arguments.method, arguments.seed) == ("pendulum", "mcl", 4)
+    assert settings == {"model.backward_net": False, "fitting.learning_rate": 0.01}
+
+
+def test_physics_from_a_file(tmp_path):
+    sets = {"train": {"length": [0.5], "mass": [1.0]}, "unseen": {}}
+    path = tmp_path / "physics.json"
+    path.write_text(json.dumps(sets))
+    _, settings = parse_train(["pendulum", "--sim-params", str(path)])
+    found = override(make_config("pendulum"), settings).sim_params
+    assert found is not None
+    assert found.to_dict() == sets
+
+
+def test_damaged_physics_file(capsys, tmp_path):
+    path = tmp_path / "physics.json"
+    path.write_text("{")
+    code, _, err = run(capsys, "train", "pendulum", "--sim-params", str(path))
+    assert code == 1
+    assert "is not JSON" in err
+
+
+def test_help_shows_the_defaults_of_the_preset(capsys):
+    code, out, err = run(capsys, "train", "pendulum", "--preset", "quick", "--help")
+    assert (code, err) == (0, "")
+    text = " ".join(out.replace("│", " ").split())
+    assert "--planner.horizon INT Imagined steps. (default: 20)" in text
+    assert "(default: quick)" in text
+    assert run(capsys, "train", "--help")[0] == 0
+
+
+def test_train_prints_a_table_the_figures_and_what_to_do_next(capsys, calls, tmp_path):
+    words = ("train", "pendulum", "--preset", "smoke", "--seed", "3", "--quiet")
+    code, out, err = run(capsys, *words)
+    assert (code, err) == (0, "")
+    for text in ("training", "length 0.5 m", "-1,091.0 ± 50.0", "1.00", str(tmp_path / "a.png")):
+        assert text in out
+    assert f"headway evaluate {tmp_path / 'run'}" in out
+    assert "headway train pendulum --preset smoke --seed 3 --quiet" in out
+    assert calls[0]["seed"] == 3
+    assert calls[0]["run_dir"] is None
+
+
+def test_train_json_is_one_line(capsys, calls, tmp_path):
+    code, out, _ = run(capsys, "train", "pendulum", "--json", "--preset", "smoke")
+    assert code == 0
+    assert out.count("\n") == 1
+    facts = json.loads(out)
+    assert facts["run_dir"] == str(tmp_path / "run")
+    assert facts["timesteps"] == 200
+    train, unseen = facts["groups"]
+    assert (train["episodes"], train["return_mean"]) == (2, -128.5)
+    assert train["score"] == pytest.approx(1.0)
+    assert unseen["score"] == pytest.approx(-50 / (1041 - 203))
+    assert [part["sim_params"]["length"] for part in facts["physics"]] == [0.5, 1.0, 1.5]
+
+
+def test_evaluate_passes_groups_and_episodes(capsys, calls):
+    words = ("evaluate", "there", "--group", "unseen", "train", "--episodes", "5", "--json")
+    code, out, _ = run(capsys, *words)
+    assert code == 0
+    assert json.loads(out)["run_dir"] == "there"
+    assert calls[0]["groups"] == ("unseen", "train")
+    assert calls[0]["num_episodes"] == 5
+    run(capsys, "evaluate", "there")
+    assert calls[1]["groups"] is None
+    assert calls[1]["num_episodes"] is None
+
+
+@pytest.mark.parametrize(
+    ("what", "names"), [("methods", METHODS), ("presets", PRESETS), ("envs", ["pendulum"])]
+)
+def test_list(capsys, what, names):
+    code, out, _ = run(capsys, "list", what)
+    assert code == 0
+    assert all(name in out for name in names)
+    code, out, _ = run(capsys, "list", what, "--json")
+    assert out.count("\n") == 1
+    listed = [entry["name"] for entry in json.loads(out)[what]]
+    assert set(names) <= set(listed)
+
+
+def test_plot_dynamics(capsys, tmp_path):
+    out_file = tmp_path / "deep" / "picture.png"
+    words = ("plot-dynamics", "pendulum", "-o", str(out_file), "--num-states", "5", "--json")
+    code, out, _ = run(capsys, *words)
+    assert code == 0
+    assert json.loads(out) == {"env": "pendulum", "figure": str(out_file)}
+    assert out_file.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_module_runs_and_help_loads_nothing_heavy():
+    code = (
+        "import sys, headway.cli\n"
+        "assert headway.cli.main(['--help']) == 0\n"
+        "heavy = {'jax', 'mujoco', 'gymnasium', 'matplotlib', 'tyro'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+    words = [sys.executable, "-m", "headway", "nonsense"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: unknown command")

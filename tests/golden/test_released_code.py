@@ -1,0 +1,211 @@
+"""The released T-MCL code's numbers on one batch, reproduced with the real loss functions.
+
+`released_code.npz` holds weights, normalisers, a batch and what the released code computed
+from them in float32. Scalars and the context must agree to 1e-5 relative. A gradient must
+agree to 1e-5 of the largest entry of its array. Both are checked in float32 and float64.
+"""
+
+import functools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from headway.config import FittingConfig
+from headway.data import History, segment_sums
+from headway.models.dynamics import ContextEncoder, GaussianNet, MultiHeadDynamics, Statistics
+from headway.models.fitting import Assignment, Batch, head_losses, total_loss
+from headway.models.losses import (
+    assign_heads,
+    independent_loss,
+    logvar_bound_loss,
+    oracle_loss,
+    weight_decay_loss,
+)
+from headway.models.networks import Dense, DenseHeads, Normalizer
+from headway.tasks.locomotion import HalfCheetahTask
+
+SEGMENT = 10
+NUM_HEADS = 3
+TOLERANCE = 1e-5
+VALUES = np.load(Path(__file__).with_name("released_code.npz"))
+TASK = HalfCheetahTask()
+
+
+def read(name):
+    return jnp.asarray(np.asarray(VALUES[name], np.float64))  # narrowed unless x64 is on
+
+
+def dense(path):
+    return Dense(read(f"{path}/weight"), read(f"{path}/bias")[:, 0])
+
+
+def dense_heads(path, kind):
+    heads = [dense(f"{path}/head{i}/{kind}") for i in range(NUM_HEADS)]
+    return DenseHeads(
+        jnp.stack([head.weight for head in heads], 1), jnp.stack([head.bias for head in heads], 1)
+    )
+
+
+def gaussian_net(path):
+    return GaussianNet(
+        tuple(dense(f"{path}/hidden{i}") for i in range(4)),
+        dense_heads(path, "mu"),
+        dense_heads(path, "logvar"),
+        read(f"{path}/max_logvar")[:, 0, 0],
+        read(f"{path}/min_logvar")[:, 0, 0],
+    )
+
+
+def dynamics(path):
+    """A model from the weights under `path`; gradients are stored under the same names."""
+    encoder = ContextEncoder(
+        tuple(dense(f"{path}/context/hidden{i}") for i in range(3)), dense(f"{path}/context/output")
+    )
+    return MultiHeadDynamics(gaussian_net(f"{path}/forward"), gaussian_net(f"{path}/backward"), encoder)
+
+
+def normalizer(name, *shape):
+    return Normalizer(
+        read(f"norm/{name}_mean").reshape(shape), read(f"norm/{name}_std").reshape(shape)
+    )
+
+
+def statistics():
+    return Statistics(
+        normalizer("obs", 18),
+        normalizer("act", 6),
+        normalizer("delta", 18),
+        normalizer("back_delta", 18),
+        normalizer("cp_act", 10, 6),
+    )
+
+
+def flat(name):
+    """One of the batch's arrays as [member, sample, feature]."""
+    values = read(f"batch/{name}")
+    return values.reshape(values.shape[0], -1, values.shape[-1])
+
+
+def batch():
+    obs = flat("obs")
+    past = History(
+        flat("history_obs_diff").reshape(2, 70, 10, 18), flat("history_act").reshape(2, 70, 10, 6)
+    )
+    return Batch(obs, flat("act"), flat("next_obs"), past, jnp.ones(obs.shape[:2]))
+
+
+def winners(losses):
+    return assign_heads(segment_sums(losses, jnp.ones(losses.shape[-1], bool), SEGMENT))
+
+
+def per_sample(heads):
+    return jnp.repeat(heads, SEGMENT, axis=-1)
+
+
+class Computed:
+    """Everything that is compared, from the project's own functions."""
+
+    def __init__(self):
+        self.model, self.statistics, self.batch = dynamics("param"), statistics(), batch()
+        self.weight = self.batch.weight
+        self.losses = self.head_losses(self.model)
+        self.segment_heads = Assignment(*map(winners, self.losses))
+        self.owners = Assignment(*map(per_sample, self.segment_heads))
+
+    def head_losses(self, model):
+        return head_losses(model, TASK, self.statistics, self.batch)
+
+    def total(self, model, owners):
+        config = FittingConfig(context_weight_decay=False)
+        return total_loss(model, self.head_losses(model), owners, self.weight, config)[0]
+
+    def scalars(self):
+        forward, backward = self.losses
+        model, weight, owners = self.model, self.weight, self.owners
+        return {
+            "loss_independent_forward": independent_loss(forward, weight),
+            "loss_independent_backward": independent_loss(backward, weight),
+            "loss_oracle_forward": oracle_loss(forward, owners.forward, weight),
+            "loss_oracle_backward": oracle_loss(backward, owners.backward, weight),
+            "loss_logvar_bound_forward": 0.01 * logvar_bound_loss(model.forward_net),
+            "loss_logvar_bound_backward": 0.01 * logvar_bound_loss(model.backward_net),
+            "loss_weight_decay_forward": weight_decay_loss(model.forward_net),
+            "loss_weight_decay_backward": weight_decay_loss(model.backward_net),
+            "loss_total_independent": self.total(model, None),
+            "loss_total_oracle": self.total(model, owners),
+        }
+
+
+@functools.cache
+def computed(x64):
+    with jax.enable_x64(x64):
+        return Computed()
+
+
+@pytest.fixture(params=[False, True], ids=["float32", "float64"])
+def result(request):
+    with jax.enable_x64(request.param):
+        yield computed(request.param)
+
+
+@pytest.mark.parametrize("name", ["delta", "back_delta"])
+def test_task_gives_the_regression_target_of_the_released_code(result, name):
+    start, end = result.batch.obs, result.batch.next_obs
+    target = TASK.target(start, end) if name == "delta" else TASK.target(end, start)
+    np.testing.assert_allclose(target, flat(name), rtol=TOLERANCE, atol=1e-6)
+
+
+def test_context_vector_is_that_of_the_released_code(result):
+    expected = VALUES["expect/context"].reshape(2, 70, 4)
+    context = result.model.context(result.batch.history, result.statistics)
+    np.testing.assert_allclose(context, expected, rtol=TOLERANCE, atol=1e-6)
+
+
+@pytest.mark.parametrize("direction", ["forward", "backward"])
+def test_every_segment_goes_to_the_released_codes_head(result, direction):
+    heads = getattr(result.segment_heads, direction)
+    np.testing.assert_array_equal(heads, VALUES[f"expect/assignment_{direction}"])
+
+
+def test_every_loss_term_equals_the_released_codes(result):
+    stored = {key for key in VALUES if key.startswith("expect/loss")}
+    scalars = result.scalars()
+    assert {f"expect/{name}" for name in scalars} == stored - {"expect/loss_mse_independent"}
+    for name, value in scalars.items():
+        np.testing.assert_allclose(value, VALUES[f"expect/{name}"], rtol=TOLERANCE, err_msg=name)
+
+
+def test_independent_squared_error_equals_the_released_codes(result):
+    silent = [
+        GaussianNet(net.hidden, net.mean_heads, None, None, None)
+        for net in (result.model.forward_net, result.model.backward_net)
+    ]
+    model = MultiHeadDynamics(*silent, result.model.context_encoder)
+    loss = independent_loss(result.head_losses(model).forward, result.weight)
+    np.testing.assert_allclose(loss, VALUES["expect/loss_mse_independent"], rtol=TOLERANCE)
+
+
+def test_every_gradient_of_the_oracle_loss_equals_the_released_codes(result):
+    gradient = jax.jit(jax.grad(result.total))(result.model, result.owners)
+    expected = dynamics("expect/grad_oracle")
+    named = jax.tree_util.tree_leaves_with_path(gradient)
+    assert len(named) == 8 + 2 * (8 + 4 + 2)
+    for (path, got), want in zip(named, jax.tree.leaves(expected), strict=True):
+        largest = float(jnp.abs(want).max())
+        assert largest > 0
+        name = jax.tree_util.keystr(path)
+        np.testing.assert_allclose(got, want, rtol=0, atol=TOLERANCE * largest, err_msg=name)
+
+
+def test_adding_the_context_encoders_decay_changes_the_total_by_exactly_that(result):
+    with_decay = total_loss(
+        result.model, result.losses, result.owners, result.weight, FittingConfig()
+    )[0]
+    extra = weight_decay_loss(result.model.context_encoder)
+    assert float(extra) > 1e-4
+    np.testing.assert_allclose(
+        with_decay - result.total(result.model, result.owners), extra, atol=2e-6
+    )

@@ -1,0 +1,272 @@
+"""Updates and epochs: finite, repeatable, traced once; heads separate what physics differ."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toys
+
+from headway.config import FittingConfig, ModelConfig
+from headway.data import Trajectory
+from headway.models import fitting
+from headway.models.dynamics import MultiHeadDynamics, Statistics
+from headway.models.fitting import FitSetup, assign_segments, fit_epoch, make_data
+
+LINEAR = ModelConfig(
+    num_members=2, num_heads=2, hidden_sizes=(16,), context_size=0, backward_net=False
+)
+
+
+def make_setup(history_length=3, **settings):
+    return FitSetup(toys.POINT, FittingConfig(**settings), history_length)
+
+
+def make_fit_data(trajectories, setup, *, members=2, statistics=None, **layout):
+    episodes, samples = toys.lay_out(
+        trajectories, future_length=setup.config.future_length, **layout
+    )
+    if statistics is None:
+        statistics = Statistics.fit(toys.POINT, trajectories, setup.history_length)
+    key = jax.random.key(9)
+    return make_data(episodes, samples, statistics, setup.config, num_members=members, key=key)
+
+
+def run_epochs(state, setup, data, epochs, *, independent=False, key=0):
+    losses, skipped = [], 0
+    for epoch_key in jax.random.split(jax.random.key(key), epochs):
+        state, stats = fit_epoch(state, setup, data, independent=independent, key=epoch_key)
+        losses.append(float(stats.loss))
+        skipped += int(stats.skipped)
+    return state, losses, skipped
+
+
+def assert_trees_equal(first, second):
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def assert_finite(tree):
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
+
+
+def two_physics(num=8, steps=20):
+    """Trajectories pushed along the action, and against it; the label is whether against."""
+    labels = np.arange(num) % 2
+    return [toys.random_trajectory(steps, i, 1.0 - 2.0 * k) for i, k in enumerate(labels)], labels
+
+
+def fit_two_physics(oracle, key=0, epochs=40):
+    trajectories, labels = two_physics()
+    setup = make_setup(
+        oracle=oracle, learning_rate=0.02, batch_size=64, future_length=1, weight_decay=0.0
+    )
+    data = make_fit_data(trajectories, setup)
+    state = setup.init(MultiHeadDynamics.init(LINEAR, toys.POINT, key=jax.random.key(key)))
+    state, losses, skipped = run_epochs(
+        state, setup, data, epochs, independent=oracle == "independent", key=key
+    )
+    assert skipped == 0
+    return state, losses, data, setup, labels
+
+
+@pytest.mark.parametrize("key", [0, 1])
+def test_trajectory_oracle_gives_each_physics_its_own_head_in_every_member(key):
+    state, losses, data, setup, labels = fit_two_physics("trajectory", key)
+    heads = np.asarray(assign_segments(state.model, setup, data.episodes, data.statistics).forward)
+    for member in heads[:, : len(labels)]:
+        first = member[0, 0]
+        np.testing.assert_array_equal(member, np.where(labels == labels[0], first, 1 - first)[:, None] * np.ones((1, 2)))
+    assert losses[-1] < losses[0] - 2.0
+
+
+def test_independent_loss_keeps_all_heads_at_the_average_of_the_physics():
+    state, losses, data, setup, _ = fit_two_physics("independent")
+    action = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (2, 50, 2)), jnp.float32)
+    x = jnp.concatenate([jnp.zeros_like(action), data.statistics.action.normalize(action)], -1)
+    mean = np.asarray(state.model.forward_net(x, None).mean)
+    assert np.abs(mean).mean() < 0.5  # opposite pushes cancel; either physics alone has about 0.9
+    best, *_ = fit_two_physics("trajectory")
+    assert np.abs(np.asarray(best.model.forward_net(x, None).mean)).mean() > 0.7
+    assert losses[-1] < losses[0]
+
+
+def small_fit(*, switches=None, lengths=(9, 5), **settings):
+    settings = {"segment_length": 3, "batch_size": 8, "future_length": 2} | settings
+    setup = make_setup(**settings)
+    config = dataclasses.replace(toys.SMALL, **(switches or {}))
+    trajectories = [toys.random_trajectory(n, seed=n) for n in lengths]
+    state = setup.init(toys.small_model(config=config))
+    return state, setup, make_fit_data(trajectories, setup, members=config.num_members)
+
+
+def test_same_key_gives_bit_equal_weights_and_another_key_does_not():
+    state, setup, data = small_fit()
+    first, losses, _ = run_epochs(state, setup, data, 3)
+    again, same, _ = run_epochs(state, setup, data, 3)
+    other, _, _ = run_epochs(state, setup, data, 3, key=1)
+    assert_trees_equal(first, again)
+    assert losses == same
+    assert (first.model.forward_net.mean_heads.weight != other.model.forward_net.mean_heads.weight).any()
+
+
+@pytest.mark.parametrize(
+    ("switches", "settings"),
+    [
+        ({"context_size": 0, "num_members": 1}, {"bootstrap": True}),
+        ({"deterministic": True}, {"oracle": "transition"}),
+        ({"backward_net": False, "num_heads": 1}, {"reduction": "segment"}),
+        ({"num_heads": 3}, {"bootstrap": True, "drop_first_anchor": True}),
+    ],
+    ids=str,
+)
+def test_every_switch_fits_without_nan_and_lowers_the_loss(switches, settings):
+    state, setup, data = small_fit(switches=switches, learning_rate=1e-2, **settings)
+    state, losses, skipped = run_epochs(state, setup, data, 8)
+    assert skipped == 0
+    assert_finite(state)
+    assert losses[-1] < losses[0]
+
+
+def test_a_constant_observation_dimension_and_one_step_episodes_give_no_nan():
+    setup = make_setup(segment_length=10, batch_size=8, future_length=5)
+    trajectories = [toys.random_trajectory(n, seed=n, constant=True) for n in (1, 6)]
+    state = setup.init(toys.small_model())
+    data = make_fit_data(trajectories, setup)
+    assert float(data.statistics.delta.std[1]) == 0.0
+    state, losses, skipped = run_epochs(state, setup, data, 3)
+    assert skipped == 0
+    assert_finite(state)
+    assert np.isfinite(losses).all()
+
+
+def test_a_data_set_of_one_transition_can_be_fitted():
+    state, setup, data = small_fit(lengths=(1,))
+    assert int(data.samples.count) == 1
+    state, stats = fit_epoch(state, setup, data, independent=False, key=jax.random.key(0))
+    assert (int(stats.updates), int(stats.skipped)) == (1, 0)
+    assert_finite(state)
+
+
+@pytest.mark.parametrize("independent", [True, False])
+def test_a_batch_larger_than_the_data_equals_a_batch_of_just_the_data(independent):
+    state, exact, data = small_fit(batch_size=24)  # 24 samples: 2*9 - 1 + 2*5 - 1 = 26 rows less 2
+    count = int(data.samples.count)
+    exact = make_setup(segment_length=3, batch_size=count, future_length=2)
+    larger = make_setup(segment_length=3, batch_size=100, future_length=2)
+    key = jax.random.key(3)
+    first, stats = fit_epoch(state, exact, data, independent=independent, key=key)
+    second, padded = fit_epoch(state, larger, data, independent=independent, key=key)
+    assert int(stats.updates) == int(padded.updates) == 1
+    np.testing.assert_allclose(stats.loss, padded.loss, rtol=1e-5)
+    for a, b in zip(jax.tree.leaves(first.model), jax.tree.leaves(second.model), strict=True):
+        np.testing.assert_allclose(a, b, atol=2e-5)
+
+
+def test_an_epoch_shows_every_sample_exactly_once_to_every_member(monkeypatch):
+    seen = []
+    gather = fitting.gather_batch
+
+    def spying(data, assignment, order, weight, setup):
+        jax.debug.callback(lambda *x: seen.append(x), order, weight)
+        return gather(data, assignment, order, weight, setup)
+
+    monkeypatch.setattr(fitting, "gather_batch", spying)
+    state, setup, data = small_fit(batch_size=7, epochs=1001)  # settings no other test compiled
+    _, stats = fit_epoch(state, setup, data, independent=True, key=jax.random.key(0))
+    jax.effects_barrier()
+    count = int(data.samples.count)
+    assert len(seen) == int(stats.updates) == -(-count // 7)
+    for member in range(2):
+        rows = np.concatenate([order[member][weight[member] > 0] for order, weight in seen])
+        np.testing.assert_array_equal(np.sort(rows), np.arange(count))
+
+
+def overflowing(steps, seed):
+    """Finite data whose squared error is not a finite float32."""
+    trajectory = toys.random_trajectory(steps, seed)
+    obs = trajectory.obs.copy()
+    obs[-1] = 1e25
+    return dataclasses.replace(trajectory, obs=obs)
+
+
+def test_only_the_update_with_non_finite_loss_is_skipped_and_counted():
+    setup = make_setup(batch_size=4, future_length=1)
+    config = dataclasses.replace(toys.SMALL, num_members=1, backward_net=False)
+    trajectories = [toys.random_trajectory(11), overflowing(1, 1)]
+    data = make_fit_data(trajectories, setup, members=1, statistics=toys.identity_statistics())
+    state = setup.init(toys.small_model(config=config))
+    fitted, stats = fit_epoch(state, setup, data, independent=True, key=jax.random.key(0))
+    assert (int(stats.updates), int(stats.skipped)) == (3, 1)
+    assert_finite(fitted)
+    assert np.isfinite(stats.loss)
+    assert np.isfinite(stats.forward_loss)
+    assert int(fitted.optimizer[0].count) == 2
+    assert (fitted.model.forward_net.mean_heads.weight != state.model.forward_net.mean_heads.weight).any()
+
+
+def test_an_epoch_of_nothing_but_non_finite_updates_leaves_everything_as_it_was():
+    state, setup, data = small_fit()
+    broken = dataclasses.replace(data.episodes, obs=jnp.full_like(data.episodes.obs, 1e25))
+    data = data._replace(episodes=broken, statistics=toys.identity_statistics())
+    data = data._replace(episodes=dataclasses.replace(broken, obs=broken.obs * data.episodes.action.mean()))
+    fitted, stats = fit_epoch(state, setup, data, independent=True, key=jax.random.key(0))
+    assert int(stats.skipped) == int(stats.updates) > 0
+    assert_trees_equal(fitted, state)
+    assert float(stats.loss) == 0.0
+
+
+def test_epochs_are_traced_once_while_the_data_grow(monkeypatch):
+    traces = []
+    original = fitting.shuffle
+    monkeypatch.setattr(fitting, "shuffle", lambda *args: traces.append(1) or original(*args))
+    setup = make_setup(segment_length=3, batch_size=8, future_length=2, epochs=1002)
+    state = setup.init(toys.small_model())
+    trajectories = []
+    for seed in range(3):
+        trajectories += [toys.random_trajectory(n, seed=seed) for n in (6, 1 + seed)]
+        data = make_fit_data(trajectories, setup, max_length=8, capacity=6, sample_capacity=80)
+        state, _, _ = run_epochs(state, setup, data, 2)
+    assert len(traces) == 1
+    run_epochs(state, setup, data, 1, independent=True)
+    assert len(traces) == 2
+
+
+def test_padding_of_episodes_and_samples_changes_nothing():
+    state, setup, data = small_fit()
+    tight = fit_epoch(state, setup, data, independent=False, key=jax.random.key(0))[1]
+    inside = np.arange(9) < np.asarray(data.episodes.length)[:, None]
+    spoiled = dataclasses.replace(
+        data.episodes, action=jnp.where(inside[..., None], data.episodes.action, jnp.nan)
+    )
+    loose = data._replace(episodes=spoiled)
+    padded = fit_epoch(state, setup, loose, independent=False, key=jax.random.key(0))[1]
+    assert int(padded.skipped) == 0
+    np.testing.assert_array_equal(tight.loss, padded.loss)
+
+
+def test_adams_moments_persist_over_epochs_and_kinds_of_loss():
+    state, setup, data = small_fit()
+    state, first = fit_epoch(state, setup, data, independent=True, key=jax.random.key(0))
+    state, second = fit_epoch(state, setup, data, independent=False, key=jax.random.key(1))
+    assert int(state.optimizer[0].count) == int(first.updates) + int(second.updates)
+
+
+def test_reported_loss_is_that_of_the_batch_before_its_update():
+    setup = make_setup(batch_size=100, future_length=1, weight_decay=0.0, logvar_bound_weight=0.0)
+    model = toys.linear_model([[np.eye(2), -np.eye(2)]])
+    trajectory = toys.random_trajectory(10)
+    data = make_fit_data([trajectory], setup, members=1, statistics=toys.identity_statistics())
+    state = setup.init(model)
+    key = jax.random.key(0)
+    _, independent = fit_epoch(state, setup, data, independent=True, key=key)
+    _, oracle = fit_epoch(state, setup, data, independent=False, key=key)
+    wrong = 4 * np.square(np.float64(trajectory.action)).mean()  # the other head's error
+    np.testing.assert_allclose(independent.loss, wrong / 2, rtol=1e-4)
+    np.testing.assert_allclose(oracle.forward_loss, 0.0, atol=1e-6)
+
+
+def test_non_finite_trajectories_never_reach_fitting():
+    with pytest.raises(RuntimeError, match="not finite"):
+        Trajectory(np.full((2, 2), np.inf), np.zeros((1, 2)), np.zeros(1), {})

@@ -1,0 +1,259 @@
+"""Losses against NumPy twins, and what must hold of any oracle."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toys
+from hypothesis import given
+from hypothesis import strategies as st
+
+from headway.config import FittingConfig
+from headway.data import segment_sums
+from headway.models.dynamics import Prediction
+from headway.models.fitting import Assignment, Batch, head_losses, total_loss
+from headway.models.losses import (
+    HEAD_DECAY,
+    assign_heads,
+    independent_loss,
+    logvar_bound_loss,
+    model_decay_loss,
+    negative_log_likelihood,
+    oracle_loss,
+    weight_decay_loss,
+)
+from headway.models.networks import bound_logvar
+
+REDUCTIONS = ["head", "segment"]
+seeds = st.integers(0, 2**16)
+sizes = st.sampled_from([(2, 3, 9), (1, 2, 4)])  # few shapes, few compilations
+
+
+def random_losses(seed, size):
+    """Losses, owners and weights (some zero, at least one not) of random samples."""
+    rng = np.random.default_rng(seed)
+    members, heads, samples = size
+    weight = (rng.random((members, samples)) < 0.7).astype(np.float32)
+    weight[:, 0] = 1.0
+    owner = rng.integers(0, heads, (members, samples)).astype(np.int32)
+    return rng.normal(size=size).astype(np.float32), owner, weight
+
+
+def twin_independent(losses, weight):
+    total = 0.0
+    for member, used in zip(losses.astype(np.float64), weight > 0, strict=True):
+        total += member[:, used].mean()
+    return total
+
+
+def twin_oracle(losses, owner, weight, reduction):
+    total = 0.0
+    for member, heads, used in zip(losses.astype(np.float64), owner, weight > 0, strict=True):
+        if reduction == "segment":
+            total += np.mean([member[heads[i], i] for i in np.flatnonzero(used)])
+            continue
+        for head in range(len(member)):
+            mine = used & (heads == head)
+            total += member[head, mine].mean() if mine.any() else 0.0
+    return total
+
+
+@given(seeds, sizes)
+def test_negative_log_likelihood_equals_its_numpy_twin(seed, size):
+    rng = np.random.default_rng(seed)
+    mean, logvar, target = rng.normal(size=(3, *size)).astype(np.float32)
+    got = negative_log_likelihood(Prediction(jnp.asarray(mean), jnp.asarray(logvar)), jnp.asarray(target))
+    twin = ((toys.f64(mean) - target) ** 2 / np.exp(toys.f64(logvar)) + logvar).mean(-1)
+    np.testing.assert_allclose(got, twin, rtol=1e-4, atol=1e-6)
+
+
+def test_without_variance_the_loss_is_the_squared_error():
+    mean, target = jnp.asarray([[1.0, 2.0]]), jnp.asarray([[0.0, 4.0]])
+    assert float(negative_log_likelihood(Prediction(mean, None), target)[0]) == pytest.approx(2.5)
+
+
+@given(seeds)
+def test_bounded_logvar_equals_its_numpy_twin_and_stays_above_the_lower_bound(seed):
+    rng = np.random.default_rng(seed)
+    low, high = rng.normal(-10, 1, 4).astype(np.float32), rng.normal(0.5, 1, 4).astype(np.float32)
+    logvar = rng.normal(0, 20, (6, 4)).astype(np.float32)
+    squeezed = toys.f64(high) - toys.softplus(toys.f64(high) - logvar)
+    twin = low + toys.softplus(squeezed - low)
+    got = bound_logvar(jnp.asarray(logvar), jnp.asarray(low), jnp.asarray(high))
+    np.testing.assert_allclose(got, twin, rtol=1e-5, atol=1e-5)
+    assert (np.asarray(got) >= low).all()
+    assert (np.asarray(got) <= high + 1e-3).all()
+
+
+@given(seeds, sizes)
+def test_independent_loss_equals_its_numpy_twin(seed, size):
+    losses, _, weight = random_losses(seed, size)
+    got = independent_loss(jnp.asarray(losses), jnp.asarray(weight))
+    np.testing.assert_allclose(got, twin_independent(losses, weight), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("reduction", REDUCTIONS)
+@given(seed=seeds, size=sizes)
+def test_oracle_loss_equals_its_numpy_twin(reduction, seed, size):
+    losses, owner, weight = random_losses(seed, size)
+    got = oracle_loss(jnp.asarray(losses), jnp.asarray(owner), jnp.asarray(weight), reduction)
+    np.testing.assert_allclose(got, twin_oracle(losses, owner, weight, reduction), rtol=1e-4, atol=1e-5)
+
+
+def test_heads_count_alike_however_few_samples_they_own():
+    losses = jnp.asarray([[[1.0, 1.0, 1.0, 9.0], [9.0, 9.0, 9.0, 5.0]]])
+    owner, weight = jnp.asarray([[0, 0, 0, 1]]), jnp.ones((1, 4))
+    assert float(oracle_loss(losses, owner, weight, "head")) == pytest.approx(1.0 + 5.0)
+    assert float(oracle_loss(losses, owner, weight, "segment")) == pytest.approx(8.0 / 4)
+
+
+@pytest.mark.parametrize("reduction", REDUCTIONS)
+@given(seed=seeds)
+def test_one_head_makes_every_oracle_equal_to_the_independent_loss(reduction, seed):
+    losses, owner, weight = map(jnp.asarray, random_losses(seed, (3, 1, 7)))
+    np.testing.assert_allclose(
+        oracle_loss(losses, owner, weight, reduction), independent_loss(losses, weight), rtol=1e-5, atol=1e-6
+    )
+
+
+@given(seed=seeds, size=sizes)
+def test_winning_heads_never_cost_more_than_the_independent_loss(seed, size):
+    losses, _, weight = map(jnp.asarray, random_losses(seed, size))
+    best = oracle_loss(losses, assign_heads(losses), weight, "segment")
+    assert float(best) <= float(independent_loss(losses, weight)) + 1e-5
+
+
+@pytest.mark.parametrize("reduction", REDUCTIONS)
+@given(seed=seeds, size=sizes, poison=st.floats(-1e6, 1e6, width=32))
+def test_padding_samples_change_nothing(reduction, seed, size, poison):
+    losses, owner, weight = random_losses(seed, size)
+    poisoned = np.where(weight[:, None] > 0, losses, np.float32(poison))
+    arrays = jnp.asarray(owner), jnp.asarray(weight)
+    for values in (losses, poisoned):
+        np.testing.assert_allclose(
+            oracle_loss(jnp.asarray(values), *arrays, reduction),
+            oracle_loss(jnp.asarray(np.where(weight[:, None] > 0, losses, 0)), *arrays, reduction),
+            rtol=1e-6,
+        )
+    np.testing.assert_allclose(
+        independent_loss(jnp.asarray(poisoned), arrays[1]),
+        independent_loss(jnp.asarray(losses), arrays[1]),
+        rtol=1e-6,
+    )
+
+
+@given(seed=seeds, size=sizes, data=st.data())
+def test_permuting_heads_permutes_assignments_and_keeps_the_loss(seed, size, data):
+    losses, _, weight = random_losses(seed, size)
+    order = np.asarray(data.draw(st.permutations(range(size[1]))))
+    before = np.asarray(assign_heads(jnp.asarray(losses)))
+    after = np.asarray(assign_heads(jnp.asarray(losses[:, order])))
+    np.testing.assert_array_equal(order[after], before)
+    np.testing.assert_allclose(
+        oracle_loss(jnp.asarray(losses[:, order]), jnp.asarray(after), jnp.asarray(weight)),
+        oracle_loss(jnp.asarray(losses), jnp.asarray(before), jnp.asarray(weight)),
+        rtol=1e-5, atol=1e-6,
+    )
+
+
+def test_ties_go_to_the_lower_head():
+    np.testing.assert_array_equal(assign_heads(jnp.zeros((1, 3, 2))), [[0, 0]])
+
+
+@given(seed=seeds, size=sizes)
+def test_segments_of_one_transition_are_the_transition_oracle(seed, size):
+    losses = jnp.asarray(random_losses(seed, size)[0])
+    sums = segment_sums(losses, jnp.ones(size[-1], bool), 1)
+    np.testing.assert_array_equal(assign_heads(sums), assign_heads(losses))
+    np.testing.assert_array_equal(assign_heads(sums), np.asarray(losses).argmin(1))
+
+
+def test_members_choose_their_heads_on_their_own():
+    losses = jnp.asarray([[[1.0], [2.0]], [[2.0], [1.0]]])
+    np.testing.assert_array_equal(assign_heads(losses), [[0], [1]])
+
+
+def random_batch(seed, samples=6, members=2):
+    rng = np.random.default_rng(seed)
+    episodes, _ = toys.lay_out([toys.random_trajectory(samples + 1, seed)])
+    step = jnp.asarray(rng.integers(0, samples, (members, samples)))
+    row = jnp.zeros_like(step)
+    return Batch(
+        episodes.obs[row, step],
+        episodes.action[row, step],
+        episodes.obs[row, step + 1],
+        episodes.history(row, step, 3),
+        jnp.ones((members, samples)),
+    )
+
+
+def gradient(model, owners, batch, config):
+    statistics = toys.odd_statistics()
+
+    @jax.jit
+    def objective(model):
+        losses = head_losses(model, toys.POINT, statistics, batch)
+        return total_loss(model, losses, owners, batch.weight, config)[0]
+
+    return jax.grad(objective)(model)
+
+
+@pytest.mark.parametrize("reduction", REDUCTIONS)
+def test_a_head_that_wins_nothing_learns_nothing_and_makes_no_nan(reduction):
+    model, batch = toys.small_model(), random_batch(0)
+    owners = Assignment(jnp.zeros((2, 6), int), jnp.ones((2, 6), int))
+    config = FittingConfig(reduction=reduction, weight_decay=0.0, logvar_bound_weight=0.0)
+    grads = gradient(model, owners, batch, config)
+    for net, winner in ((grads.forward_net, 0), (grads.backward_net, 1)):
+        for heads in (net.mean_heads, net.logvar_heads):
+            for values in (heads.weight, heads.bias):
+                assert not np.asarray(values[:, 1 - winner]).any()
+                assert np.asarray(values[:, winner]).any()
+        assert not np.asarray(net.max_logvar[1 - winner]).any()
+        assert not np.asarray(net.min_logvar[1 - winner]).any()
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))
+
+
+def test_a_sample_of_no_weight_gives_no_gradient():
+    model, batch = toys.small_model(), random_batch(1)
+    owners = Assignment(jnp.zeros((2, 6), int), jnp.zeros((2, 6), int))
+    weight = batch.weight.at[:, 3:].set(0.0)
+    spoiled = batch._replace(weight=weight, next_obs=batch.next_obs.at[:, 3:].add(100.0))
+    config = FittingConfig()
+    first = gradient(model, owners, batch._replace(weight=weight), config)
+    second = gradient(model, owners, spoiled, config)
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
+
+
+def test_context_encoder_learns_through_both_directions():
+    model, batch = toys.small_model(), random_batch(2)
+    both = gradient(model, None, batch, FittingConfig(weight_decay=0.0))
+    forward = gradient(model, None, batch, FittingConfig(weight_decay=0.0, backward_weight=0.0))
+    encoder = both.context_encoder.output.weight, forward.context_encoder.output.weight
+    assert np.asarray(encoder[1]).any()
+    assert np.abs(np.asarray(encoder[0] - encoder[1])).max() > 1e-6
+
+
+def test_weight_decay_equals_its_numpy_twin_and_spares_biases():
+    model = toys.f64(toys.small_model())
+    for net in (model.forward_net, model.backward_net, model.context_encoder):
+        layers = [*net.hidden] + ([net.output] if net is model.context_encoder else [])
+        twin = sum(
+            c / 2 * (layer.weight**2).sum()
+            for c, layer in zip((2.5e-5, 5e-5, 7.5e-5, 7.5e-5), layers, strict=False)
+        )
+        if net is not model.context_encoder:
+            twin += HEAD_DECAY / 2 * sum((h.weight**2).sum() for h in (net.mean_heads, net.logvar_heads))
+        np.testing.assert_allclose(weight_decay_loss(net), twin, rtol=1e-5)
+    assert HEAD_DECAY == 1e-4
+    grads = jax.grad(lambda m: model_decay_loss(m, context=True))(toys.small_model())
+    assert not np.asarray(grads.forward_net.hidden[0].bias).any()
+    assert not np.asarray(grads.forward_net.mean_heads.bias).any()
+
+
+def test_logvar_bound_loss_is_upper_minus_lower_and_nothing_without_variance():
+    net = toys.small_model().forward_net
+    twin = np.asarray(net.max_logvar).sum() - np.asarray(net.min_logvar).sum()
+    np.testing.assert_allclose(logvar_bound_loss(net), twin, rtol=1e-6)
+    assert float(logvar_bound_loss(toys.linear_model(np.ones((1, 1, 2, 2))).forward_net)) == 0.0

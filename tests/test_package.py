@@ -1,0 +1,148 @@
+"""What is promised about the package itself: light imports, one version, tidy files."""
+
+import inspect
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+import headway
+
+ROOT = Path(__file__).parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+DOCS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+HEAVY = {"gymnasium", "matplotlib", "mujoco", "ray", "tensorboardX"}
+FOLDERS = "benchmarks|docs|examples|results|src|tests"
+
+
+def run_python(code: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    return done.stdout
+
+
+def test_import_is_light():
+    loaded = set(run_python("import headway, sys; print(*sys.modules)").split())
+    assert "headway" in loaded
+    assert not HEAVY & loaded
+
+
+def test_core_loads_no_simulator():
+    code = "import headway.models.fitting, headway.planning.agent, sys; print(*sys.modules)"
+    assert not HEAVY & set(run_python(code).split())
+
+
+def test_version_is_the_one_in_pyproject():
+    assert headway.__version__ == PROJECT["project"]["version"]
+
+
+@pytest.mark.parametrize("name", headway.__all__)
+def test_public_name_resolves_and_is_documented(name):
+    value = getattr(headway, name)
+    if inspect.isclass(value) or inspect.isroutine(value):
+        doc = value.__doc__ or ""
+        # A dataclass without a docstring gets its signature as one.
+        assert doc
+        assert not doc.startswith(f"{name}(")
+
+
+def test_unknown_public_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = headway.no_such_name
+
+
+def test_wheel_holds_the_package_and_its_type_marker(tmp_path):
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(command, check=True, capture_output=True, cwd=ROOT)
+    (wheel,) = tmp_path.glob("*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    package = ROOT / "src"
+    sources = {str(path.relative_to(package)) for path in package.rglob("*.py")}
+    assert sources | {"headway/py.typed"} <= names
+    assert {name.partition("/")[0] for name in names} == {
+        "headway",
+        f"headway-{headway.__version__}.dist-info",
+    }
+
+
+@pytest.mark.parametrize("folder", ["src", "tests", "benchmarks", "examples"])
+def test_no_file_is_over_400_lines(folder):
+    lengths = {
+        str(path.relative_to(ROOT)): len(path.read_text().splitlines())
+        for path in (ROOT / folder).rglob("*.py")
+    }
+    assert {path: lines for path, lines in lengths.items() if lines > 400} == {}
+
+
+def test_readme_is_short():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 150
+
+
+def requirements() -> list[Requirement]:
+    """Everything that pyproject.toml asks for, the GPU build aside."""
+    found = [*PROJECT["project"]["dependencies"], *PROJECT["build-system"]["requires"]]
+    for group in PROJECT["dependency-groups"].values():
+        found += group
+    return [Requirement(text) for text in found]
+
+
+def pins() -> list[Requirement]:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    return [Requirement(line) for line in lines if not line.startswith("#")]
+
+
+def test_constraints_are_names_and_exact_versions_only():
+    for pin in pins():
+        (specifier,) = pin.specifier
+        assert specifier.operator == "=="
+        assert "*" not in specifier.version
+        assert pin.url is None
+        assert not pin.extras
+    assert not re.search(r"://|--|@", (ROOT / "constraints.txt").read_text())
+
+
+@pytest.mark.parametrize("python", ["3.11", "3.12", "3.13"])
+def test_constraints_pin_every_requirement_once(python):
+    versions = {}
+    for pin in pins():
+        if pin.marker is None or pin.marker.evaluate({"python_version": python}):
+            name = canonicalize_name(pin.name)
+            assert name not in versions
+            versions[name] = next(iter(pin.specifier)).version
+    for wanted in requirements():
+        assert wanted.specifier.contains(versions[canonicalize_name(wanted.name)])
+
+
+def link_targets(page: Path) -> Iterator[str]:
+    """Relative links, and paths of this repository written as code."""
+    text = page.read_text()
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    for target in re.findall(r"\]\(([^)\s]+)[^)]*\)", prose):
+        if not re.match(r"[a-z]+:", target):
+            yield target
+    for target in re.findall(rf"`((?:{FOLDERS})/[\w./-]+)`", prose):
+        yield str(ROOT / target)
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that a page's headings get."""
+    titles = re.findall(r"^#+ +(.*)$", page.read_text(), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", DOCS, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    for target in link_targets(page):
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path) if path else page
+        assert file.exists(), f"{page.name} links to {target}, which is not there"
+        if anchor:
+            assert anchor in anchors(file), f"{page.name} links to {target}: no such heading"

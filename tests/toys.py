@@ -1,0 +1,128 @@
+"""Tiny tasks, data and exactly known models that the tests of the core share."""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from headway.config import ModelConfig
+from headway.data import Episodes, Samples, Trajectory
+from headway.models.dynamics import GaussianNet, MultiHeadDynamics, Statistics
+from headway.models.networks import Dense, DenseHeads
+from headway.tasks.base import Task
+
+
+class PointTask(Task):
+    """Two numbers pushed by two forces; the reward wants the state at zero, cheaply."""
+
+    obs_size: ClassVar[int] = 2
+    action_size: ClassVar[int] = 2
+    action_low: ClassVar[tuple[float, ...]] = (-1.0, -1.0)
+    action_high: ClassVar[tuple[float, ...]] = (1.0, 1.0)
+
+    def reward(self, obs, action, next_obs):
+        return -jnp.square(next_obs).sum(-1) - 0.1 * jnp.square(action).sum(-1)
+
+
+class ScaledTask(PointTask):
+    """Actions of other units, extra features and a termination, to leave nothing at identity."""
+
+    action_low: ClassVar[tuple[float, ...]] = (-2.0, 0.0)
+    action_high: ClassVar[tuple[float, ...]] = (2.0, 3.0)
+
+    def reward(self, obs, action, next_obs):
+        return obs[..., 0] + 2.0 * next_obs[..., 1] - 0.3 * action[..., 0] + action[..., 1]
+
+    def released_reward(self, obs, action, next_obs):
+        return obs[..., 0]
+
+    def terminated(self, obs, action, next_obs):
+        return next_obs[..., 0] > 1.0
+
+    def preprocess(self, obs):
+        return jnp.concatenate([obs[..., :1], jnp.sin(obs[..., 1:]), jnp.cos(obs[..., 1:])], -1)
+
+
+SMALL = ModelConfig(
+    num_members=2,
+    num_heads=2,
+    hidden_sizes=(8, 8),
+    context_size=3,
+    context_hidden_sizes=(6,),
+    history_length=3,
+)
+POINT = PointTask()
+
+
+def random_trajectory(steps, seed=0, gain=1.0, *, constant=False):
+    """`obs' = obs + gain * action` under random actions; `constant` freezes the second number."""
+    rng = np.random.default_rng(seed)
+    action = rng.uniform(-1, 1, (steps, 2)).astype(np.float32)
+    pushed = gain * action * [1.0, 0.0 if constant else 1.0]
+    obs = rng.normal(size=2) + np.concatenate([np.zeros((1, 2)), np.cumsum(pushed, axis=0)])
+    return Trajectory(obs.astype(np.float32), action, np.zeros(steps, np.float32), {"gain": float(gain)})
+
+
+def lay_out(trajectories, *, max_length=None, capacity=None, future_length=2, sample_capacity=None):
+    """Episodes and samples of some trajectories, padded by a little at least."""
+    lengths = [len(t) for t in trajectories]
+    count = sum(min(future_length, length - t) for length in lengths for t in range(length))
+    episodes = Episodes.pad(trajectories, capacity or len(lengths) + 1, max_length or max(lengths))
+    return episodes, Samples.table(lengths, future_length, sample_capacity or count + 3)
+
+
+def small_model(seed=0, task=POINT, config=SMALL):
+    """A random model whose biases and variance bounds are not at their initial values either."""
+    rng = np.random.default_rng(seed)
+    shapes = jax.eval_shape(lambda key: MultiHeadDynamics.init(config, task, key=key), jax.random.key(0))
+
+    def draw(path, leaf):
+        bound = {"max_logvar": 0.5, "min_logvar": -10.0}.get(path[-1].name, 0.0)
+        spread = 0.5 if path[-1].name == "weight" else 0.2
+        return jnp.asarray(bound + spread * rng.normal(size=leaf.shape), jnp.float32)
+
+    return jax.tree_util.tree_map_with_path(draw, shapes)
+
+
+def linear_model(gains):
+    """A deterministic model that is exactly `delta = action @ gain`, with no context.
+
+    One hidden layer of x and -x, because swish(x) - swish(-x) = x.
+
+    Args:
+        gains: [member, head, action, obs].
+    """
+    gains = np.asarray(gains, np.float32)
+    members, heads, action_size, obs_size = gains.shape
+    size = obs_size + action_size
+    twice = np.concatenate([np.eye(size), -np.eye(size)], axis=1).astype(np.float32)
+    full = np.concatenate([np.zeros((members, heads, obs_size, obs_size)), gains], axis=2)
+    hidden = Dense(jnp.asarray(np.tile(twice, (members, 1, 1))), jnp.zeros((members, 2 * size)))
+    weight = jnp.asarray(np.concatenate([full, -full], axis=2), jnp.float32)
+    mean_heads = DenseHeads(weight, jnp.zeros((members, heads, obs_size)))
+    return MultiHeadDynamics(GaussianNet((hidden,), mean_heads, None, None, None), None, None)
+
+
+def identity_statistics(task=POINT, history_length=3):
+    return Statistics.identity(task, history_length)
+
+
+def odd_statistics(task=POINT, history_length=3, seed=5):
+    """Normalisers that shift and scale everything differently."""
+    rng = np.random.default_rng(seed)
+
+    def odd(like):
+        shift, scale = rng.normal(size=like.shape), rng.uniform(0.5, 2.0, like.shape)
+        return jnp.asarray(scale if (like == 1).all() else shift, jnp.float32)
+
+    return jax.tree.map(odd, Statistics.identity(task, history_length))
+
+
+def softplus(x):
+    return np.logaddexp(0.0, x)
+
+
+def f64(tree):
+    """The same tree in NumPy's float64, for twins."""
+    return jax.tree.map(lambda x: np.asarray(x, np.float64), tree)
