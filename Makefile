@@ -10,10 +10,6 @@ INSTALL := $(PIP) install -qq -c constraints.txt
 SPECS := pyproject.toml constraints.txt
 CONSTRAINED_PYTHONS ?= python3.11 python3.12
 
-# Rendering tests draw off screen, with OSMesa or EGL, whichever is installed.
-OFFSCREEN = MUJOCO_GL=$${MUJOCO_GL:-$$($(BIN)/python -c "from ctypes.util import find_library as find; \
-	print('osmesa' if find('OSMesa') else 'egl')")}
-
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help demo test test-slow lint bench docs constraints clean
@@ -25,10 +21,10 @@ demo: $(VENV)/main.stamp ## Train and evaluate T-MCL on Pendulum, in minutes
 	@$(BIN)/headway train pendulum --preset quick --seed 0 --run-dir runs/demo
 
 test: $(VENV)/test.stamp ## Run the tests; JOBS=4 runs four at a time
-	@$(OFFSCREEN) $(BIN)/python -m pytest -n $(JOBS) -m "not slow"
+	@$(BIN)/python -m pytest -n $(JOBS) -m "not slow"
 
 test-slow: $(VENV)/test.stamp ## Run the tests that take minutes each
-	@$(OFFSCREEN) $(BIN)/python -m pytest -m slow
+	@$(BIN)/python -m pytest -m slow
 
 lint: $(VENV)/test.stamp $(VENV)/lint.stamp ## Check style, types and import rules
 	@$(BIN)/ruff check

@@ -4,10 +4,10 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
-import toys
 from hypothesis import given
 from hypothesis import strategies as st
 
+import toys
 from headway.data import (
     Episodes,
     ReplayBuffer,
@@ -16,7 +16,7 @@ from headway.data import (
     history_action_moments,
     segment_sums,
 )
-from headway.errors import ConfigError, EnvironmentFault
+from headway.errors import BadEnvironmentError, ConfigError
 
 RAGGED = [1, 7, 3, 12]
 lengths_lists = st.lists(st.integers(1, 30), min_size=1, max_size=4)
@@ -107,9 +107,7 @@ def test_segment_sums_equal_their_numpy_twin(steps, segment, num_valid, seed):
     values = np.random.default_rng(seed).normal(size=(2, steps)).astype(np.float32)
     valid = np.arange(steps) < num_valid
     starts = range(0, steps, segment)
-    twin = [
-        [row[s : s + segment][valid[s : s + segment]].sum() for s in starts] for row in values
-    ]
+    twin = [[row[s : s + segment][valid[s : s + segment]].sum() for s in starts] for row in values]
     got = segment_sums(jnp.asarray(values), jnp.asarray(valid), segment)
     np.testing.assert_allclose(got, twin, rtol=1e-5, atol=1e-5)
 
@@ -154,7 +152,7 @@ def test_a_trajectory_of_mismatched_lengths_is_refused(shapes):
 def test_a_non_finite_number_in_a_trajectory_is_named_with_its_step_and_physics(name):
     arrays = {"obs": np.zeros((4, 2)), "action": np.zeros((3, 1)), "reward": np.zeros(3)}
     arrays[name][2] = np.nan
-    with pytest.raises(EnvironmentFault, match=f"{name} at step 2 is not finite.*length.*0.5"):
+    with pytest.raises(BadEnvironmentError, match=f"{name} at step 2 is not finite.*length.*0.5"):
         Trajectory(**arrays, sim_params={"length": 0.5})
 
 
@@ -170,6 +168,6 @@ def test_buffer_keeps_everything_and_refuses_other_widths():
         buffer.add(toys.random_trajectory(n))
     assert len(buffer) == len(RAGGED)
     assert buffer.num_transitions == sum(RAGGED)
-    with pytest.raises(EnvironmentFault, match=r"widths \(3, 1\), allowed: \(2, 2\)"):
+    with pytest.raises(BadEnvironmentError, match=r"widths \(3, 1\), allowed: \(2, 2\)"):
         buffer.add(Trajectory(np.zeros((2, 3)), np.zeros((1, 1)), np.zeros(1), {}))
     assert len(buffer) == len(RAGGED)

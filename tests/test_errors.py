@@ -10,7 +10,7 @@ from headway import errors
     [
         (errors.ConfigError, ValueError),
         (errors.UnknownNameError, KeyError),
-        (errors.EnvironmentFault, RuntimeError),
+        (errors.BadEnvironmentError, RuntimeError),
         (errors.RunError, RuntimeError),
         (errors.DivergenceError, ArithmeticError),
     ],

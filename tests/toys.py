@@ -61,7 +61,9 @@ def random_trajectory(steps, seed=0, gain=1.0, *, constant=False):
     action = rng.uniform(-1, 1, (steps, 2)).astype(np.float32)
     pushed = gain * action * [1.0, 0.0 if constant else 1.0]
     obs = rng.normal(size=2) + np.concatenate([np.zeros((1, 2)), np.cumsum(pushed, axis=0)])
-    return Trajectory(obs.astype(np.float32), action, np.zeros(steps, np.float32), {"gain": float(gain)})
+    return Trajectory(
+        obs.astype(np.float32), action, np.zeros(steps, np.float32), {"gain": float(gain)}
+    )
 
 
 def lay_out(trajectories, *, max_length=None, capacity=None, future_length=2, sample_capacity=None):
@@ -75,7 +77,9 @@ def lay_out(trajectories, *, max_length=None, capacity=None, future_length=2, sa
 def small_model(seed=0, task=POINT, config=SMALL):
     """A random model whose biases and variance bounds are not at their initial values either."""
     rng = np.random.default_rng(seed)
-    shapes = jax.eval_shape(lambda key: MultiHeadDynamics.init(config, task, key=key), jax.random.key(0))
+    shapes = jax.eval_shape(
+        lambda key: MultiHeadDynamics.init(config, task, key=key), jax.random.key(0)
+    )
 
     def draw(path, leaf):
         bound = {"max_logvar": 0.5, "min_logvar": -10.0}.get(path[-1].name, 0.0)

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from headway.config import Config as Config
     from headway.data import ReplayBuffer as ReplayBuffer
     from headway.data import Trajectory as Trajectory
+    from headway.errors import BadEnvironmentError as BadEnvironmentError
     from headway.errors import ConfigError as ConfigError
     from headway.errors import DivergenceError as DivergenceError
-    from headway.errors import EnvironmentFault as EnvironmentFault
     from headway.errors import HeadwayError as HeadwayError
     from headway.errors import RunError as RunError
     from headway.errors import UnknownNameError as UnknownNameError
@@ -50,7 +50,7 @@ _HOME = {
     "errors": (
         "ConfigError",
         "DivergenceError",
-        "EnvironmentFault",
+        "BadEnvironmentError",
         "HeadwayError",
         "RunError",
         "UnknownNameError",

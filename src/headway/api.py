@@ -64,7 +64,7 @@ def train(
         UnknownNameError: No such environment, method or preset.
         ConfigError: A setting is unknown, of the wrong type or out of range.
         RunError: The directory holds something else.
-        EnvironmentFault: The environment broke its contract.
+        BadEnvironmentError: The environment broke its contract.
         DivergenceError: Fitting lost all finite numbers.
     """
     config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)

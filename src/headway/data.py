@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from headway.errors import ConfigError, EnvironmentFault
+from headway.errors import BadEnvironmentError, ConfigError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Trajectory:
         for name in ("obs", "action", "reward"):
             if not np.isfinite(getattr(self, name)).all():
                 step = int(np.argwhere(~np.isfinite(getattr(self, name)))[0][0])
-                raise EnvironmentFault(
+                raise BadEnvironmentError(
                     f"{name} at step {step} is not finite, allowed: finite numbers; check the"
                     f" environment under sim_params {dict(self.sim_params)}."
                 )
@@ -137,9 +137,7 @@ class Samples(NamedTuple):
         """
         rows = [np.zeros((0, 3), np.int32)]
         for episode, length in enumerate(lengths):
-            anchor, offset = np.meshgrid(
-                np.arange(length), np.arange(future_length), indexing="ij"
-            )
+            anchor, offset = np.meshgrid(np.arange(length), np.arange(future_length), indexing="ij")
             valid = (anchor + offset < length) & (anchor >= int(drop_first))
             triple = np.stack([np.full_like(anchor, episode), anchor, offset], axis=-1)
             rows.append(triple[valid].astype(np.int32))
@@ -173,11 +171,11 @@ class ReplayBuffer:
         """Append one trajectory.
 
         Raises:
-            EnvironmentFault: Its observations or actions are of another width.
+            BadEnvironmentError: Its observations or actions are of another width.
         """
         got = (trajectory.obs.shape[1], trajectory.action.shape[1])
         if got != (self.obs_size, self.action_size):
-            raise EnvironmentFault(
+            raise BadEnvironmentError(
                 f"a trajectory has observations and actions of widths {got}, allowed:"
                 f" {(self.obs_size, self.action_size)}, as its Task says."
             )

@@ -19,7 +19,7 @@ class UnknownNameError(HeadwayError, KeyError):
         return str(self.args[0])
 
 
-class EnvironmentFault(HeadwayError, RuntimeError):
+class BadEnvironmentError(HeadwayError, RuntimeError):
     """An environment broke its contract: wrong shape, non-finite values."""
 
 

@@ -8,7 +8,7 @@ import pytest
 from headway import api
 from headway.cli import main
 from headway.cli.commands import parse_train
-from headway.config import override
+from headway.settings import override
 from headway.errors import RunError
 from headway.experiment.methods import METHODS, PRESETS, make_config
 from headway.experiment.runs import EpisodeRow

@@ -64,7 +64,9 @@ def dynamics(path):
     encoder = ContextEncoder(
         tuple(dense(f"{path}/context/hidden{i}") for i in range(3)), dense(f"{path}/context/output")
     )
-    return MultiHeadDynamics(gaussian_net(f"{path}/forward"), gaussian_net(f"{path}/backward"), encoder)
+    return MultiHeadDynamics(
+        gaussian_net(f"{path}/forward"), gaussian_net(f"{path}/backward"), encoder
+    )
 
 
 def normalizer(name, *shape):

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import toys
 
+import toys
 from headway.config import FittingConfig
 from headway.models.fitting import (
     Assignment,
@@ -141,7 +141,9 @@ def test_a_sample_has_its_own_transition_but_its_anchors_history_and_head():
     count = int(data.samples.count)
     order = jnp.tile(jnp.arange(count)[::-1], (2, 1))
     weight = jnp.ones(order.shape)
-    batch, owners = gather_batch(data, Assignment(heads, 1 - heads), order, weight, setup(segment_length=2))
+    batch, owners = gather_batch(
+        data, Assignment(heads, 1 - heads), order, weight, setup(segment_length=2)
+    )
     table = np.stack(data.samples[:3], axis=-1)[:count][::-1]
     assert (table[:, 2] > 0).any()
     for i, (episode, anchor, offset) in enumerate(table):

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import toys
 
+import toys
 from headway.data import History
 from headway.models.dynamics import MultiHeadDynamics, Statistics, network_input
 

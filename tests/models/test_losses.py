@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import toys
 from hypothesis import given
 from hypothesis import strategies as st
 
+import toys
 from headway.config import FittingConfig
 from headway.data import segment_sums
 from headway.models.dynamics import Prediction
@@ -62,7 +62,9 @@ def twin_oracle(losses, owner, weight, reduction):
 def test_negative_log_likelihood_equals_its_numpy_twin(seed, size):
     rng = np.random.default_rng(seed)
     mean, logvar, target = rng.normal(size=(3, *size)).astype(np.float32)
-    got = negative_log_likelihood(Prediction(jnp.asarray(mean), jnp.asarray(logvar)), jnp.asarray(target))
+    got = negative_log_likelihood(
+        Prediction(jnp.asarray(mean), jnp.asarray(logvar)), jnp.asarray(target)
+    )
     twin = ((toys.f64(mean) - target) ** 2 / np.exp(toys.f64(logvar)) + logvar).mean(-1)
     np.testing.assert_allclose(got, twin, rtol=1e-4, atol=1e-6)
 
@@ -97,7 +99,9 @@ def test_independent_loss_equals_its_numpy_twin(seed, size):
 def test_oracle_loss_equals_its_numpy_twin(reduction, seed, size):
     losses, owner, weight = random_losses(seed, size)
     got = oracle_loss(jnp.asarray(losses), jnp.asarray(owner), jnp.asarray(weight), reduction)
-    np.testing.assert_allclose(got, twin_oracle(losses, owner, weight, reduction), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(
+        got, twin_oracle(losses, owner, weight, reduction), rtol=1e-4, atol=1e-5
+    )
 
 
 def test_heads_count_alike_however_few_samples_they_own():
@@ -112,7 +116,10 @@ def test_heads_count_alike_however_few_samples_they_own():
 def test_one_head_makes_every_oracle_equal_to_the_independent_loss(reduction, seed):
     losses, owner, weight = map(jnp.asarray, random_losses(seed, (3, 1, 7)))
     np.testing.assert_allclose(
-        oracle_loss(losses, owner, weight, reduction), independent_loss(losses, weight), rtol=1e-5, atol=1e-6
+        oracle_loss(losses, owner, weight, reduction),
+        independent_loss(losses, weight),
+        rtol=1e-5,
+        atol=1e-6,
     )
 
 
@@ -152,7 +159,8 @@ def test_permuting_heads_permutes_assignments_and_keeps_the_loss(seed, size, dat
     np.testing.assert_allclose(
         oracle_loss(jnp.asarray(losses[:, order]), jnp.asarray(after), jnp.asarray(weight)),
         oracle_loss(jnp.asarray(losses), jnp.asarray(before), jnp.asarray(weight)),
-        rtol=1e-5, atol=1e-6,
+        rtol=1e-5,
+        atol=1e-6,
     )
 
 
@@ -244,7 +252,11 @@ def test_weight_decay_equals_its_numpy_twin_and_spares_biases():
             for c, layer in zip((2.5e-5, 5e-5, 7.5e-5, 7.5e-5), layers, strict=False)
         )
         if net is not model.context_encoder:
-            twin += HEAD_DECAY / 2 * sum((h.weight**2).sum() for h in (net.mean_heads, net.logvar_heads))
+            twin += (
+                HEAD_DECAY
+                / 2
+                * sum((h.weight**2).sum() for h in (net.mean_heads, net.logvar_heads))
+            )
         np.testing.assert_allclose(weight_decay_loss(net), twin, rtol=1e-5)
     assert HEAD_DECAY == 1e-4
     grads = jax.grad(lambda m: model_decay_loss(m, context=True))(toys.small_model())

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import toys
 
+import toys
 from headway.config import PlannerConfig
 from headway.models.dynamics import GaussianNet, MultiHeadDynamics
 from headway.models.networks import DenseHeads, Normalizer
@@ -174,4 +174,6 @@ def test_history_equals_that_of_the_same_episode_in_the_data_at_every_step(lengt
         for got, want in zip(recent.history(length), expected, strict=True):
             np.testing.assert_array_equal(got, want)
         obs, action = jnp.asarray(trajectory.obs), jnp.asarray(trajectory.action)
-        recent = recent.push(obs[None, step], action[None, step], obs[None, step + 1], jnp.asarray([True]))
+        recent = recent.push(
+            obs[None, step], action[None, step], obs[None, step + 1], jnp.asarray([True])
+        )

@@ -131,7 +131,9 @@ def test_a_round_of_cem_equals_its_numpy_twin():
         returns = -((candidates[env] - aim) ** 2).sum((-1, -2))
         elites = candidates[env][np.argsort(-returns)[:8]]
         np.testing.assert_allclose(plan.actions[env], 0.2 * 0.5 + 0.8 * elites.mean(0), atol=1e-6)
-        np.testing.assert_allclose(plan.expected_return[env], np.sort(returns)[-8:].mean(), rtol=1e-5)
+        np.testing.assert_allclose(
+            plan.expected_return[env], np.sort(returns)[-8:].mean(), rtol=1e-5
+        )
 
 
 def test_variance_of_cem_shrinks_by_the_elites_variance_and_the_smoothing():

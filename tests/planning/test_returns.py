@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import toys
 
+import toys
 from headway.models.dynamics import GaussianNet, MultiHeadDynamics, network_input
 from headway.models.networks import DenseHeads
 from headway.planning.returns import ImaginedDynamics, candidate_returns
@@ -39,9 +39,7 @@ def fold(model, heads, statistics=None, context=None):
 
 def returns_of(dynamics, obs, candidates, task=toys.POINT, **settings):
     settings = {"particles_per_member": 2, "key": KEY} | settings
-    return candidate_returns(
-        dynamics, task, jnp.asarray(obs), jnp.asarray(candidates), **settings
-    )
+    return candidate_returns(dynamics, task, jnp.asarray(obs), jnp.asarray(candidates), **settings)
 
 
 def twin_returns(gains, heads, obs, candidates, reward, *, low, high, end=np.inf):
@@ -96,9 +94,7 @@ def test_rewards_use_the_environments_units_and_stop_after_termination():
     got = returns_of(dynamics, obs, candidates, task)
     np.testing.assert_allclose(got, ended, rtol=1e-4, atol=1e-4)
     released = returns_of(dynamics, obs, candidates, task, released_reward=True)
-    lagging = twin_returns(
-        gains, heads, obs, candidates, lambda x, a, y: x[0], **bounds, end=1.0
-    )
+    lagging = twin_returns(gains, heads, obs, candidates, lambda x, a, y: x[0], **bounds, end=1.0)
     np.testing.assert_allclose(released, lagging, rtol=1e-4, atol=1e-4)
 
 
@@ -106,7 +102,9 @@ def test_what_a_terminated_rollout_does_next_cannot_spoil_its_return():
     gains = np.zeros((1, 1, 2, 2))
     gains[0, 0, 0, 0], gains[0, 0, 1, 1] = 2.0, 1e38  # first ends the episode, then overflows
     candidates = np.array([[[[1.0, 0.0], [1.0, 1.0], [1.0, 1.0]]]], np.float32)
-    got = returns_of(fold(toys.linear_model(gains), [[[0]]]), np.zeros((1, 2)), candidates, CornerTask())
+    got = returns_of(
+        fold(toys.linear_model(gains), [[[0]]]), np.zeros((1, 2)), candidates, CornerTask()
+    )
     np.testing.assert_allclose(got, [[-0.3 * 2.0 + 1.5]], rtol=1e-5)
 
 
@@ -114,7 +112,9 @@ def test_a_rollout_that_leaves_the_finite_numbers_has_a_non_finite_return():
     gains = np.full((1, 1, 2, 2), 1e25)
     candidates = np.zeros((1, 2, 3, 2), np.float32)
     candidates[0, 1] = 1.0
-    got = np.asarray(returns_of(fold(toys.linear_model(gains), [[[0]]]), np.zeros((1, 2)), candidates))
+    got = np.asarray(
+        returns_of(fold(toys.linear_model(gains), [[[0]]]), np.zeros((1, 2)), candidates)
+    )
     np.testing.assert_array_equal(np.isfinite(got), [[True, False]])
 
 
@@ -130,7 +130,9 @@ def test_particles_stay_with_their_member_for_the_whole_horizon():
 def random_walk_dynamics(std, num_heads=1):
     """A model that never moves but for its noise, equally for each head."""
     net = toys.linear_model(np.zeros((1, num_heads, 2, 2))).forward_net
-    logvar = DenseHeads(jnp.zeros(net.mean_heads.weight.shape), jnp.full((1, num_heads, 2), 2 * np.log(std)))
+    logvar = DenseHeads(
+        jnp.zeros(net.mean_heads.weight.shape), jnp.full((1, num_heads, 2), 2 * np.log(std))
+    )
     bounds = jnp.full((num_heads, 2), 20.0), jnp.full((num_heads, 2), -40.0)
     model = MultiHeadDynamics(GaussianNet(net.hidden, net.mean_heads, logvar, *bounds), None, None)
     return fold(model, [[list(range(num_heads))]])
@@ -181,10 +183,16 @@ def test_folded_model_equals_the_unfolded_one(which, with_context):
         whole = model.forward_net(inputs, wide)
         for member in range(2):
             picked = heads[env, member]
-            raw = np.asarray(whole.mean)[member, picked] * statistics.delta.std + statistics.delta.mean
+            raw = (
+                np.asarray(whole.mean)[member, picked] * statistics.delta.std
+                + statistics.delta.mean
+            )
             std = np.exp(0.5 * np.asarray(whole.logvar)[member, picked]) * statistics.delta.std
             np.testing.assert_allclose(mean[member, env], raw.mean(0), rtol=1e-3, atol=2e-4)
             blended = np.sqrt((std**2).sum(0)) / len(picked)
             np.testing.assert_allclose(
-                sample[member, env] - mean[member, env], noise[member, env] * blended, rtol=1e-3, atol=2e-4
+                sample[member, env] - mean[member, env],
+                noise[member, env] * blended,
+                rtol=1e-3,
+                atol=2e-4,
             )

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from headway import config as config_module
+from headway import settings
 from headway.config import CollectionConfig, Config
 from headway.experiment.runs import EpisodeRow, RunDir
 
@@ -70,7 +70,7 @@ def write(path, *, iterations=5, evaluated=(4,), env="pendulum", members=5, head
         collection=CollectionConfig(num_iterations=iterations, num_episodes=5),
     )
     path.mkdir(parents=True, exist_ok=True)
-    content = {"schema": 1, "config": config_module.to_dict(config)}
+    content = {"schema": 1, "config": settings.to_dict(config)}
     (path / "config.json").write_text(json.dumps(content))
     run.write_metrics(metrics_rows(rng, iterations, evaluated))
     rows = [

@@ -7,6 +7,7 @@ Headway's, 2 wrong usage, 130 interrupted.
 import os
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 from headway import __version__
 from headway.cli.usage import UsageError, closest, one_line
@@ -57,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         advice = "; the same command goes on after the last finished iteration"
         print(f"interrupted{advice if words[:1] == ['train'] else ''}", file=sys.stderr)
-        return 130
+        return _leave(130) if argv is None else 130
 
 
 def _dispatch(words: list[str]) -> int:
@@ -83,6 +84,13 @@ def _describe(error: OSError) -> str:
     if error.filename is None:
         return str(error)
     return f"cannot use {error.filename}: {error.strerror}; check the path and its permissions."
+
+
+def _leave(code: int) -> NoReturn:
+    """End the process at once: XLA's threads may still compute, and would crash a slow exit."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def _fail(text: str, code: int) -> int:

@@ -54,7 +54,10 @@ def train(words: Sequence[str]) -> int:
     for title, lines in (
         ("Figures", [str(path) for path in run.figures]),
         ("Test it again", [shlex.join(["headway", "evaluate", str(run.path)])]),
-        ("Resume it", [shlex.join(["headway", "train", *words])]),
+        (
+            "The command, which resumes what was interrupted",
+            [shlex.join(["headway", "train", *words])],
+        ),
     ):
         print(f"{title}:", *lines, sep="\n  ")
     return 0

@@ -156,7 +156,7 @@ class ClassicEnv(WorldEnv):
 
     def __init__(self, world: ClassicWorld, render_mode: str | None):
         super().__init__(world, render_mode)
-        self.metadata = self.metadata | {"render_fps": round(1 / world.time_step)}  # pyright: ignore[reportAttributeAccessIssue]
+        self.metadata = self.metadata | {"render_fps": round(1 / world.time_step)}
         self._state = np.zeros((1, world.state_size))
         self._action = np.zeros(1)
 

@@ -87,7 +87,7 @@ def cart_pole(x: float, angle: float, length: float, push: float, mass_scale: fl
     canvas.line(pivot, tip, 0.07 * bulk, BODY)
     canvas.disc(pivot, 0.028, PAPER)
     if abs(push) > 0.02:
-        _arrow(canvas, (x, -0.32), 0.5 * push)
+        _arrow(canvas, (x + np.sign(push) * (width / 2 + 0.05), pivot[1]), 0.5 * push)
     return canvas.image()
 
 
@@ -107,7 +107,7 @@ def pendulum(angle: float, length: float, torque: float) -> np.ndarray:
         length: Of the rod (m).
         torque: In units of its limit.
     """
-    canvas = Canvas(112.0)
+    canvas = Canvas(122.0)
     for radius in (0.5, 1.0, 1.5):
         canvas.ring((0.0, 0.0), radius, 0.01, GRID)
     canvas.line((0.0, 1.6), (0.0, 1.85), 0.012, GRID)

@@ -1,3 +1,6 @@
+# pyright: reportAttributeAccessIssue=false
+# (the names compiled into mujoco have no stubs)
+
 """Hopper, SlimHumanoid, HalfCheetah and CrippledAnt, stepped one at a time by MuJoCo."""
 
 from typing import Any
@@ -5,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from headway.envs.rendering import Camera, OffscreenRenderer
+from headway.envs.rendering import OffscreenRenderer
 from headway.envs.robots import (
     CrippledAnt,
     HalfCheetah,
@@ -25,7 +28,7 @@ class LocomotionEnv(WorldEnv):
 
     def __init__(self, robot: Robot, render_mode: str | None):
         super().__init__(robot, render_mode)
-        self.metadata = self.metadata | {"render_fps": round(1 / robot.time_step)}  # pyright: ignore[reportAttributeAccessIssue]
+        self.metadata = self.metadata | {"render_fps": round(1 / robot.time_step)}
         self.model = robot.new_model()
         self.data = mujoco.MjData(self.model)
         self._velocity = 0.0
@@ -37,7 +40,7 @@ class LocomotionEnv(WorldEnv):
 
         Raises:
             ConfigError: The action has the wrong shape or is not finite.
-            EnvironmentFault: The simulation diverged.
+            BadEnvironmentError: The simulation diverged.
         """
         robot, data = self._world, self.data
         action = robot.clip(action, (self.model.nu,))
@@ -75,12 +78,12 @@ class LocomotionEnv(WorldEnv):
         """Draw the present state, if `render_mode` is `"rgb_array"`.
 
         Raises:
-            EnvironmentFault: No OpenGL library for drawing without a screen was found.
+            BadEnvironmentError: No OpenGL library for drawing without a screen was found.
         """
         if self.render_mode is None:
             return None
         if self._renderer is None:
-            self._renderer = OffscreenRenderer(self.model, Camera(*self._world.camera))
+            self._renderer = OffscreenRenderer(self.model, self._world.camera)
         return self._renderer.frame(self.model, self.data)
 
     def close(self) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 from gymnasium.vector import AutoresetMode
 
-from headway.envs.classic import CartPoleWorld, PendulumWorld
+from headway.envs.classic import CartPoleWorld, ClassicWorld, PendulumWorld
 from headway.envs.robots import CrippledAnt, HalfCheetah, Hopper, Robot, SlimHumanoid
 from headway.envs.vector import HeadwayVectorEnv, SequentialVectorEnv, WorldVectorEnv
 from headway.envs.vector_worlds import ClassicVectorEnv, RolloutVectorEnv
@@ -90,10 +90,10 @@ def make_vec(
 def _vector(
     world: World, num_envs: int, autoreset_mode: AutoresetMode | str, length: int | None
 ) -> WorldVectorEnv:
-    kind: Callable[..., WorldVectorEnv] = (
-        RolloutVectorEnv if isinstance(world, Robot) else ClassicVectorEnv
-    )
-    return kind(world, num_envs, autoreset_mode, length)
+    if isinstance(world, Robot):
+        return RolloutVectorEnv(world, num_envs, autoreset_mode, length)
+    assert isinstance(world, ClassicWorld)
+    return ClassicVectorEnv(world, num_envs, autoreset_mode, length)
 
 
 def _built_in(spec: EnvSpec) -> str | None:

@@ -1,3 +1,6 @@
+# pyright: reportAttributeAccessIssue=false
+# (the names compiled into mujoco have no stubs)
+
 """Drawing MuJoCo scenes without a screen, through EGL or OSMesa."""
 
 import ctypes.util
@@ -10,9 +13,12 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from headway.errors import EnvironmentFault
+from headway.errors import BadEnvironmentError
 
 WIDTH, HEIGHT = 640, 480
+GREY = (0.42, 0.44, 0.47, 1.0)
+_TORSO, _NEAR, _FAR = (0.20, 0.40, 0.64, 1.0), (0.80, 0.47, 0.24, 1.0), (0.62, 0.33, 0.16, 1.0)
+_PALE, _PALER, _SKY = (0.62, 0.64, 0.65), (0.74, 0.75, 0.75), (0.70, 0.79, 0.88)
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 
 
@@ -24,6 +30,37 @@ class Camera:
     elevation: float
     height: float
     azimuth: float = 90.0
+
+
+def restyle(spec: mujoco.MjSpec) -> None:
+    """Give a model a pale floor and sky; its physics does not change."""
+    for texture in spec.textures:
+        if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
+            texture.rgb1, texture.rgb2 = _SKY, (0.95, 0.96, 0.97)
+        elif texture.type == mujoco.mjtTexture.mjTEXTURE_2D:
+            texture.rgb1, texture.rgb2 = _PALE, _PALER
+    for material in spec.materials:
+        material.reflectance = 0.0
+        material.specular = 0.1
+    for light in spec.lights:
+        light.diffuse = (0.55, 0.55, 0.55)
+        light.specular = (0.15, 0.15, 0.15)
+        light.dir = (0.15, 0.25, -1.0)
+    spec.visual.headlight.ambient = (0.42, 0.42, 0.42)
+    spec.visual.headlight.diffuse = (0.32, 0.32, 0.32)
+
+
+def paint(model: mujoco.MjModel) -> None:
+    """Colour the torso blue and the limbs orange, those of the far side darker."""
+    for geom in range(model.ngeom):
+        body = model.geom_bodyid[geom]
+        name = model.body(body).name
+        if body == 0:
+            model.geom_rgba[geom] = 1.0
+            continue
+        far = name.startswith(("left", "fthigh", "fshin", "ffoot"))
+        model.geom_matid[geom] = -1
+        model.geom_rgba[geom] = _TORSO if body == 1 else _FAR if far else _NEAR
 
 
 class OffscreenRenderer:
@@ -52,6 +89,8 @@ class OffscreenRenderer:
         mujoco.mj_comPos(model, data)
         mujoco.mj_camlight(model, data)
         torso = data.xpos[1]
+        data.light_xpos[:, :2] = torso[:2] - (0.6, 1.0)
+        data.light_xpos[:, 2] = 4.0
         self._view.lookat[:] = torso[0], torso[1], self._camera.height
         self._context.make_current()
         mujoco.mjv_updateScene(
@@ -80,7 +119,7 @@ def opengl_library() -> str:
     """Return the OpenGL library to draw with: `"egl"`, `"osmesa"` or MuJoCo's choice.
 
     Raises:
-        EnvironmentFault: None is installed.
+        BadEnvironmentError: None is installed.
     """
     chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
     if chosen or not sys.platform.startswith("linux"):
@@ -102,8 +141,8 @@ def _new_context() -> Any:
         raise _no_opengl(f"{library} failed: {reason}") from error
 
 
-def _no_opengl(reason: str) -> EnvironmentFault:
-    return EnvironmentFault(
+def _no_opengl(reason: str) -> BadEnvironmentError:
+    return BadEnvironmentError(
         f"cannot draw without a screen: {reason}; on Debian, `apt-get install libegl1 libgl1` (or"
         " libosmesa6), and leave MUJOCO_GL unset or set it to egl or osmesa."
     )

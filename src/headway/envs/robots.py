@@ -1,3 +1,6 @@
+# pyright: reportAttributeAccessIssue=false
+# (the names compiled into mujoco have no stubs)
+
 """The four MuJoCo robots: what is observed, what is paid, and what their physics means.
 
 All formulas are NumPy on arrays with any number of leading axes. The models are the XML
@@ -15,8 +18,9 @@ from typing import Any, ClassVar, NamedTuple
 import mujoco
 import numpy as np
 
+from headway.envs.rendering import GREY, Camera, paint, restyle
 from headway.envs.world import World
-from headway.errors import EnvironmentFault
+from headway.errors import BadEnvironmentError
 from headway.sim_params import SimParamSets
 from headway.tasks.base import Task
 from headway.tasks.locomotion import (
@@ -42,8 +46,7 @@ class Robot(World):
     obs_dtype = np.float64
     xml: ClassVar[str]
     frame_skip: ClassVar[int]
-    camera: ClassVar[tuple[float, float, float]]
-    """Distance (m), elevation (degrees) and height (m) of the point looked at."""
+    camera: ClassVar[Camera]
 
     def __init__(self, task: Task, sim_params: SimParamSets | None):
         super().__init__(task, sim_params)
@@ -84,10 +87,10 @@ class Robot(World):
         """Notice that MuJoCo met a non-finite or huge number and started over.
 
         Raises:
-            EnvironmentFault: A control step took less than its time.
+            BadEnvironmentError: A control step took less than its time.
         """
         if elapsed < self.time_step - 0.5 * self.nominal.opt.timestep:
-            raise EnvironmentFault(
+            raise BadEnvironmentError(
                 f"the simulation of {self.name} diverged under sim_params {dict(sim_params)},"
                 " allowed: finite states; use less extreme sim_params."
             )
@@ -116,7 +119,7 @@ class Hopper(ScaledRobot):
     """Laws of `HopperEnv`."""
 
     name, xml, frame_skip = "hopper", "hopper.xml", 4
-    camera = (3.6, -8.0, 0.85)
+    camera = Camera(distance=3.1, elevation=-8.0, height=0.75)
 
     def __init__(
         self,
@@ -151,7 +154,7 @@ class SlimHumanoid(ScaledRobot):
     """Laws of `SlimHumanoidEnv`."""
 
     name, xml, frame_skip = "slim-humanoid", "humanoid.xml", 5
-    camera = (4.2, -10.0, 0.95)
+    camera = Camera(distance=3.6, elevation=-8.0, height=0.9)
 
     def __init__(self, sim_params: SimParamSets | None = None, *, scale_inertia: bool = False):
         super().__init__(SlimHumanoidTask(scale_inertia), sim_params)
@@ -179,7 +182,7 @@ class HalfCheetah(ScaledRobot):
     """Laws of `HalfCheetahEnv`."""
 
     name, xml, frame_skip = "half-cheetah", "half_cheetah.xml", 5
-    camera = (3.4, -12.0, 0.45)
+    camera = Camera(distance=2.9, elevation=-12.0, height=0.45)
 
     def __init__(self, sim_params: SimParamSets | None = None, *, scale_inertia: bool = False):
         super().__init__(HalfCheetahTask(scale_inertia), sim_params)
@@ -204,7 +207,7 @@ class CrippledAnt(Robot):
     """Laws of `CrippledAntEnv`."""
 
     name, xml, frame_skip = "crippled-ant", "ant.xml", 5
-    camera = (4.5, -28.0, 0.4)
+    camera = Camera(distance=3.4, elevation=-40.0, height=0.3)
     choices: ClassVar[Mapping[str, tuple[float, ...]]] = {"crippled_leg": (-1, 0, 1, 2, 3)}
     leg_geoms = (
         ("left_leg_geom", "left_ankle_geom"),
@@ -235,7 +238,7 @@ class CrippledAnt(Robot):
         if leg < 0:
             return
         upper, lower = (model.geom(name).id for name in self.leg_geoms[leg])
-        model.geom_rgba[[upper, lower]] = 0.75, 0.2, 0.15, 1.0
+        model.geom_rgba[[upper, lower]] = GREY
         if self.shrink_leg:
             model.geom_size[[upper, lower]] *= 0.5
             model.geom_pos[lower] = model.geom_pos[upper]
@@ -286,7 +289,9 @@ def load_model(xml: str) -> mujoco.MjModel:
     spec = mujoco.MjSpec.from_file(str(path))
     total_mass = spec.compiler.settotalmass
     spec.compiler.settotalmass = -1
+    restyle(spec)
     model = spec.compile()
+    paint(model)
     if total_mass > 0:
         mujoco.mj_setTotalmass(model, total_mass)
         mujoco.mj_setConst(model, mujoco.MjData(model))

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -40,7 +40,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     `AutoresetMode.DISABLED` an environment goes on stepping until it is reset.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}  # pyright: ignore[reportIncompatibleVariableOverride]
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as in Gymnasium)
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(spaces[0], num_envs)
         self.action_space = batch_space(spaces[1], num_envs)
         self.autoreset_mode = mode
-        self.metadata = self.metadata | {"autoreset_mode": mode}  # pyright: ignore[reportAttributeAccessIssue]
+        self.metadata = self.metadata | {"autoreset_mode": mode}
         self.episode_length = episode_length
         self._elapsed = np.zeros(num_envs, int)
         self._finished = np.zeros(num_envs, bool)
@@ -89,7 +89,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Raises:
             ConfigError: Actions have the wrong shape or are not finite.
-            EnvironmentFault: A simulation diverged.
+            BadEnvironmentError: A simulation diverged.
         """
         actions = self._check_actions(actions)
         rewards = np.zeros(self.num_envs)
@@ -139,13 +139,13 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Turn values per parameter into parameters per environment."""
         rows: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for name, column in values.items():
-            column = np.asarray(column)
-            if column.shape not in ((), (self.num_envs,)):
+            given = np.asarray(column)
+            if given.shape not in ((), (self.num_envs,)):
                 raise ConfigError(
-                    f"sim_params {name} has shape {column.shape}, allowed: one value, or"
+                    f"sim_params {name} has shape {given.shape}, allowed: one value, or"
                     f" {self.num_envs}, one per environment."
                 )
-            for row, value in zip(rows, np.broadcast_to(column, self.num_envs), strict=True):
+            for row, value in zip(rows, np.broadcast_to(given, self.num_envs), strict=True):
                 row[name] = value.item()
         return [self._check_sim_params(row) for row in rows]
 

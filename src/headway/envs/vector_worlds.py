@@ -1,3 +1,6 @@
+# pyright: reportAttributeAccessIssue=false
+# (the names compiled into mujoco have no stubs)
+
 """Vector environments of the built-in worlds: NumPy for the classic ones, MuJoCo's rollout."""
 
 import os

@@ -65,11 +65,13 @@ class World(abc.ABC):
         known = self.catalog_entry.default_sim_params
         if name not in known:
             raise ConfigError(str(unknown_name(f"{self.name} sim_param", str(name), known)))
-        allowed = self.choices.get(name)
-        number = _as_float(value)
-        if number not in allowed if allowed else not (math.isfinite(number) and number > 0):
-            what = ", ".join(f"{choice:g}" for choice in allowed or ()) or "finite numbers above 0"
-            raise ConfigError(f"{self.name} sim_params {name} is {value!r}, allowed: {what}.")
+        number, choices = _as_float(value), self.choices.get(name)
+        if choices is not None:
+            fits, allowed = number in choices, ", ".join(f"{choice:g}" for choice in choices)
+        else:
+            fits, allowed = math.isfinite(number) and number > 0, "finite numbers above 0"
+        if not fits:
+            raise ConfigError(f"{self.name} sim_params {name} is {value!r}, allowed: {allowed}.")
         return number
 
     def draw(self, rng: np.random.Generator, requested: SimParams) -> SimParams:
@@ -93,7 +95,7 @@ class World(abc.ABC):
                 f" {actions.tolist()}, allowed: finite numbers of shape {shape}."
             )
         low, high = self.task.action_low, self.task.action_high
-        return np.clip(actions, np.float32(low), np.float32(high))
+        return np.clip(actions, np.asarray(low, np.float32), np.asarray(high, np.float32))
 
 
 def read_options(options: Mapping[str, Any] | None, known: tuple[str, ...]) -> dict[str, Any]:
@@ -122,7 +124,7 @@ def _as_float(value: Any) -> float:
 class WorldEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One environment of a world, whose physics can be set and whose state can be copied."""
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 50}  # pyright: ignore[reportIncompatibleVariableOverride]
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 (as in Gymnasium)
 
     def __init__(self, world: World, render_mode: str | None):
         if render_mode not in (None, "rgb_array"):

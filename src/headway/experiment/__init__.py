@@ -1,0 +1,1 @@
+"""How it is measured: methods, rollouts, evaluation, run directories, training."""

@@ -54,14 +54,14 @@ def prediction_error(
     horizon = agent.planner.horizon
     slots = max(agent.history_length, agent.planner.selection_length)
     starts = [(t, s) for t in trajectories for s in range(slots, len(t) - horizon + 1)]
-    starts = [starts[i] for i in np.unique(np.linspace(0, len(starts) - 1, NUM_STARTS, dtype=int))
-              ] if starts else []  # fmt: skip
     if not starts:
         return np.zeros(0)
+    starts = [starts[i] for i in np.linspace(0, len(starts) - 1, NUM_STARTS, dtype=int)]
     std = np.concatenate([t.obs for t in trajectories]).std(0)
 
     def cut(before: int, after: int, shift: int, name: str):
-        return jnp.asarray([getattr(t, name)[s - before + shift : s + after + shift] for t, s in starts])
+        rows = [getattr(t, name)[s - before + shift : s + after + shift] for t, s in starts]
+        return jnp.asarray(np.stack(rows))
 
     recent = RecentTransitions(
         cut(slots, 0, 0, "obs"),
@@ -96,6 +96,7 @@ def _imagine(
         obs = agent.task.postprocess(obs, dynamics.sample_delta(x, None))
         return obs, obs[:, :, 0]
 
-    start = jnp.broadcast_to(recent.next_obs[:, -1][None, :, None], (members, len(actions), 1, agent.task.obs_size))
+    now = recent.next_obs[:, -1]
+    start = jnp.broadcast_to(now[None, :, None], (members, len(now), 1, now.shape[-1]))
     _, imagined = jax.lax.scan(step, start, actions.transpose(1, 0, 2))
     return imagined.transpose(1, 2, 0, 3)

@@ -7,7 +7,7 @@ from jaxtyping import PRNGKeyArray
 
 from headway.config import Config
 from headway.data import Trajectory
-from headway.experiment.rollouts import Episode, Arena, agent_policy, run_episodes
+from headway.experiment.rollouts import Arena, Episode, agent_policy, run_episodes
 from headway.experiment.runs import EpisodeRow
 from headway.planning.agent import Agent
 from headway.sim_params import SimParamSets

@@ -8,8 +8,9 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from headway.config import Config, override
+from headway.config import Config
 from headway.errors import ConfigError, unknown_name
+from headway.settings import override
 from headway.tasks.catalog import EnvSpec, env_spec
 
 Settings = Mapping[str, Any]

@@ -5,7 +5,7 @@ One vector environment and one compiled agent serve collection and evaluation al
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from jaxtyping import Float, PRNGKeyArray
 from headway import envs
 from headway.config import Config
 from headway.data import Trajectory
-from headway.errors import EnvironmentFault
+from headway.errors import BadEnvironmentError
 from headway.planning.agent import Agent
 from headway.tasks.base import Task
 from headway.tasks.catalog import EnvSpec, env_spec
@@ -44,7 +44,7 @@ class Arena:
         """Build the batch of environments that a configuration asks for.
 
         Raises:
-            EnvironmentFault: The environment's spaces do not fit its Task.
+            BadEnvironmentError: The environment's spaces do not fit its Task.
         """
         spec = env_spec(config.env)
         options = {**spec.options, **config.env_options}
@@ -61,7 +61,7 @@ class Arena:
         got = (vector.single_observation_space.shape, vector.single_action_space.shape)
         allowed = ((task.obs_size,), (task.action_size,))
         if got != allowed:
-            raise EnvironmentFault(
+            raise BadEnvironmentError(
                 f"{config.env} has observation and action shapes {got}, allowed: {allowed}, as"
                 f" its Task says; correct the environment or the Task."
             )
@@ -120,15 +120,14 @@ def run_episodes(
         on_step: Called after each step with the number of environments that stepped.
 
     Raises:
-        EnvironmentFault: An environment returned non-finite or misshapen values.
+        BadEnvironmentError: An environment returned non-finite or misshapen values.
     """
     wanted = len(episodes)
     filled = [*episodes, *[episodes[-1]] * (arena.vector.num_envs - wanted)]
     names = filled[0].sim_params
     sim_params = {name: np.array([e.sim_params[name] for e in filled]) for name in names}
-    obs, _ = arena.vector.reset(
-        seed=[episode.seed for episode in filled], options={"sim_params": sim_params}
-    )
+    seeds: Any = [episode.seed for episode in filled]
+    obs, _ = arena.vector.reset(seed=seeds, options={"sim_params": sim_params})
     observations, actions, rewards = [check(arena, obs, filled, "obs", 0)], [], []
     length = np.zeros(len(filled), np.int64)
     terminated = np.zeros(len(filled), bool)
@@ -169,20 +168,20 @@ def check(
     """Refuse what no model should learn from.
 
     Raises:
-        EnvironmentFault: Values are misshapen or not finite; the message says where.
+        BadEnvironmentError: Values are misshapen or not finite; the message says where.
     """
     values = np.asarray(values)
     width = (arena.task.obs_size,) if what == "obs" else ()
     allowed = (arena.vector.num_envs, *width)
     if values.shape != allowed:
-        raise EnvironmentFault(
+        raise BadEnvironmentError(
             f"{arena.spec.name} returned {what} of shape {values.shape} at step {step}, allowed:"
             f" {allowed}; correct the environment."
         )
     bad = ~np.isfinite(values.reshape(len(values), -1)).all(1)
     if bad.any():
         physics = episodes[int(np.argmax(bad))].sim_params
-        raise EnvironmentFault(
+        raise BadEnvironmentError(
             f"{arena.spec.name} returned a non-finite {what} at step {step} under sim_params"
             f" {physics}, allowed: finite numbers; check the environment under these physics."
         )

@@ -13,7 +13,7 @@ from typing import Any
 
 import jax
 
-from headway import config as config_module
+from headway import settings
 from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import ConfigError, RunError
@@ -94,7 +94,7 @@ class RunDir:
                 f"{self.path} is not empty and holds no run, allowed: a new directory or one"
                 " made by `headway train`; choose another --run-dir."
             )
-        found = config_module.differences(self.config(), config)
+        found = settings.differences(self.config(), config)
         if found:
             raise RunError(
                 f"{self.path} holds a run with other settings ({'; '.join(found)}); choose"
@@ -116,7 +116,7 @@ class RunDir:
                 " this version of headway; train the run again."
             )
         try:
-            return config_module.from_dict(values["config"])
+            return settings.from_dict(values["config"])
         except (ConfigError, KeyError) as error:
             raise RunError(f"{self.path / 'config.json'} is damaged: {error}") from None
 
@@ -187,14 +187,16 @@ class RunDir:
         try:
             typed = [
                 {
-                    column: value if column in texts else (int if column in wholes else float)(value)
+                    column: value
+                    if column in texts
+                    else (int if column in wholes else float)(value)
                     for column, value in row.items()
                 }
                 for row in rows
             ]
         except ValueError as error:
             raise RunError(f"{self.path / name} is damaged ({error}); delete it.") from None
-        return [row for row in typed if row["iteration"] < self.finished_iterations]
+        return [row for row in typed if int(row["iteration"]) < self.finished_iterations]
 
 
 def format_sim_params(sim_params: Mapping[str, float]) -> str:
@@ -217,7 +219,7 @@ def parse_sim_params(text: str) -> dict[str, float]:
 def _config_file(config: Config) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
-        "config": config_module.to_dict(config),
+        "config": settings.to_dict(config),
         "versions": {
             "python": platform.python_version(),
             **{name: importlib.metadata.version(name) for name in VERSIONED},

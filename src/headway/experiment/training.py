@@ -17,10 +17,10 @@ from headway.experiment import storage
 from headway.experiment.diagnostics import head_shares, prediction_error
 from headway.experiment.evaluation import episode_rows, evaluate_agent
 from headway.experiment.progress import Progress
-from headway.experiment.rollouts import Episode, Arena, agent_policy, random_policy, run_episodes
+from headway.experiment.rollouts import Arena, Episode, agent_policy, random_policy, run_episodes
 from headway.experiment.runs import RunDir
 from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.models.fitting import FitSetup, FitState, fit_epoch, make_data
+from headway.models.fitting import EpochStats, FitSetup, FitState, fit_epoch, make_data
 from headway.planning.agent import Agent
 from headway.tasks.base import Task
 from headway.tasks.catalog import env_spec
@@ -65,7 +65,7 @@ class Trainer:
 
         Raises:
             RunError: The directory holds another run, or a damaged one.
-            EnvironmentFault: The environment does not fit its Task.
+            BadEnvironmentError: The environment does not fit its Task.
         """
         arena = Arena.make(config)
         run.create_or_resume(config)
@@ -82,9 +82,30 @@ class Trainer:
         """The agent as learned so far."""
         return make_agent(self.config, self.arena.task, self.learned)
 
-    def phase(self, iteration: int, name: str, total: int) -> None:
+    def phase(self, iteration: int, name: str) -> None:
         """Announce what comes next."""
+        total = self.amount_of_work(iteration)[name]
         self.progress.phase(iteration, self.config.collection.num_iterations, name, total)
+
+    def amount_of_work(self, iteration: int) -> dict[str, int]:
+        """Environment steps or epochs of each phase of an iteration."""
+        length, config = self.arena.episode_length, self.config
+        num_tests = len(self.groups(iteration)) * config.evaluation.num_episodes
+        return {
+            "collect": config.collection.num_episodes * length,
+            "fit": config.fitting.epochs,
+            "evaluate": num_tests * length,
+        }
+
+    def groups(self, iteration: int) -> list[str]:
+        """The groups that are tested after an iteration; often none."""
+        evaluation = self.config.evaluation
+        last = iteration == self.config.collection.num_iterations - 1
+        if not last and (iteration + 1) % evaluation.every:
+            return []
+        train, *unseen = (self.config.sim_params or self.arena.spec.sim_params).group_names
+        with_train = last or evaluation.training_group == "always"
+        return [train, *unseen] if with_train else unseen
 
     def run_iteration(self, iteration: int) -> None:
         """Collect, fit, evaluate and save; only the last write makes it count."""
@@ -122,7 +143,7 @@ class Trainer:
             policy = random_policy(arena, rng)
         else:
             policy = agent_policy(self.agent, num_episodes, key=key)
-        self.phase(iteration, "collect", num_episodes * arena.episode_length)
+        self.phase(iteration, "collect")
         rollout = run_episodes(arena, episodes, policy, self.progress.advance)
         for trajectory in rollout.trajectories:
             self.buffer.add(trajectory)
@@ -163,42 +184,31 @@ class Trainer:
             or fitting.oracle == "independent"
             or config.model.num_heads == 1
         )
-        self.phase(iteration, "fit", fitting.epochs)
-        state, stats, skipped, updates = self.learned.fit, None, 0, 0
+        self.phase(iteration, "fit")
+        state, history = self.learned.fit, []
         for epoch in range(fitting.epochs):
             one_key = jax.random.fold_in(epoch_key, epoch)
             state, stats = fit_epoch(state, self.setup, data, independent=independent, key=one_key)
-            stats = jax.device_get(stats)
-            skipped, updates = skipped + int(stats.skipped), updates + int(stats.updates)
-            if stats.skipped == stats.updates:
-                raise DivergenceError(
-                    f"no update of epoch {epoch} of iteration {iteration} had a finite loss and"
-                    " gradient; try a smaller fitting.learning_rate."
-                )
-            self.progress.advance(1, loss=float(stats.loss))
+            history.append(jax.device_get(stats))
+            check_epoch(history[-1], iteration, epoch)
+            self.progress.advance(1, loss=float(history[-1].loss))
         self.learned = Learned(state, statistics)
         return {
-            "loss": float(stats.loss),
-            "forward_loss": float(stats.forward_loss),
-            "updates": updates,
-            "skipped_updates": skipped,
+            "loss": float(history[-1].loss),
+            "forward_loss": float(history[-1].forward_loss),
+            "updates": sum(int(stats.updates) for stats in history),
+            "skipped_updates": sum(int(stats.skipped) for stats in history),
             "transitions": sum(lengths),
         }
 
     def evaluate(self, iteration: int, key: PRNGKeyArray) -> dict[str, list[Trajectory]]:
         """Test on the unseen groups, and on the training physics when the settings say so."""
-        config, evaluation = self.config, self.config.evaluation
-        last = iteration == config.collection.num_iterations - 1
-        if not last and (iteration + 1) % evaluation.every:
+        groups = self.groups(iteration)
+        if not groups:
             return {}
-        train, *unseen = (config.sim_params or self.arena.spec.sim_params).group_names
-        with_train = last or evaluation.training_group == "always"
-        groups = [train, *unseen] if with_train else unseen
-        total = len(groups) * evaluation.num_episodes * self.arena.episode_length
-        self.phase(iteration, "evaluate", total)
-        return evaluate_agent(
-            self.agent, self.arena, config, groups, key=key, on_step=self.progress.advance
-        )
+        self.phase(iteration, "evaluate")
+        advance = self.progress.advance
+        return evaluate_agent(self.agent, self.arena, self.config, groups, key=key, on_step=advance)
 
     def save(
         self,
@@ -237,9 +247,25 @@ def train_run(config: Config, run_dir: str | Path, progress: Progress | None = N
     """
     with progress or Progress() as shown:
         trainer = Trainer.open(config, RunDir(run_dir), shown)
-        for iteration in range(trainer.run.finished_iterations, config.collection.num_iterations):
+        todo = range(trainer.run.finished_iterations, config.collection.num_iterations)
+        work = [(i, trainer.amount_of_work(i)) for i in todo]
+        shown.schedule([(i, name, total) for i, amounts in work for name, total in amounts.items()])
+        for iteration in todo:
             trainer.run_iteration(iteration)
     return trainer.run
+
+
+def check_epoch(stats: EpochStats, iteration: int, epoch: int) -> None:
+    """Stop a fit that has lost all finite numbers.
+
+    Raises:
+        DivergenceError: No update of the epoch was taken.
+    """
+    if stats.skipped == stats.updates:
+        raise DivergenceError(
+            f"no update of epoch {epoch} of iteration {iteration} had a finite loss and gradient;"
+            " try a smaller fitting.learning_rate."
+        )
 
 
 def make_agent(config: Config, task: Task, learned: Learned) -> Agent:

@@ -30,7 +30,8 @@ def jit_networks(function: Callable) -> Callable:
 
     @functools.cache
     def compiled() -> Callable:
-        return eqx.filter_jit(function, compiler_options=compiler_options())
+        options: dict[str, Any] = {"compiler_options": compiler_options()}
+        return eqx.filter_jit(function, **options)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:

@@ -90,6 +90,7 @@ class ContextEncoder(eqx.Module):
         return cls(tuple(hidden), output)
 
     def __call__(self, x: Float[Array, "member batch in"]) -> Float[Array, "member batch context"]:
+        """Encode flattened histories."""
         for layer in self.hidden:
             x = jax.nn.relu(layer(x))
         return self.output(x)

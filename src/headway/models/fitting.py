@@ -5,7 +5,7 @@ whole data set, then forward and backward losses are minimised in mini-batches.
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -96,7 +96,8 @@ class FitSetup(eqx.Module):
 
     def init(self, model: MultiHeadDynamics) -> FitState:
         """Start fitting a new model."""
-        return FitState(model, self.optimizer.init(model))
+        parameters: Any = model
+        return FitState(model, self.optimizer.init(parameters))
 
 
 def head_losses(
@@ -172,7 +173,7 @@ def assign_segments(
         batch = jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *x.shape)), batch)
         losses = head_losses(model, setup.task, statistics, batch)
         valid = time < episodes.length[episode]
-        return Assignment(*(x if x is None else winners(x, valid) for x in losses))
+        return Assignment(*jax.tree.map(lambda loss: winners(loss, valid), losses))
 
     def winners(losses: Float[Array, "member head time"], valid: Bool[Array, " time"]):
         return assign_heads(segment_sums(losses, valid, setup.segment_length))
@@ -223,8 +224,8 @@ def update(
         return total_loss(model, losses, owners, batch.weight, setup.config)
 
     (loss, forward), grads = jax.value_and_grad(objective, has_aux=True)(state.model)
-    changes, optimizer = setup.optimizer.update(grads, state.optimizer, state.model)
-    stepped = FitState(optax.apply_updates(state.model, changes), optimizer)
+    changes, optimizer = setup.optimizer.update(grads, state.optimizer)
+    stepped = FitState(eqx.apply_updates(state.model, changes), optimizer)
     finite = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(grads))
     kept = jax.tree.map(functools.partial(jnp.where, finite), stepped, state)
     return kept, (jnp.where(finite, loss, 0.0), jnp.where(finite, forward, 0.0), ~finite)

@@ -85,8 +85,9 @@ def weight_decay_loss(net: GaussianNet | ContextEncoder) -> Float[Array, ""]:
     else:
         heads = [head for head in (net.mean_heads, net.logvar_heads) if head is not None]
     decays = [HIDDEN_DECAY[min(i, len(HIDDEN_DECAY) - 1)] for i in range(len(layers))]
-    hidden = sum(c * jnp.square(la.weight).sum() for c, la in zip(decays, layers, strict=True))
-    return 0.5 * (hidden + HEAD_DECAY * sum(jnp.square(head.weight).sum() for head in heads))
+    weighted = [*zip(decays, layers, strict=True), *((HEAD_DECAY, head) for head in heads)]
+    penalties = [c * jnp.square(layer.weight).sum() for c, layer in weighted]
+    return 0.5 * jnp.stack(penalties).sum()
 
 
 def model_decay_loss(model: MultiHeadDynamics, *, context: bool) -> Float[Array, ""]:

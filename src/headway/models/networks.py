@@ -69,6 +69,7 @@ class Dense(eqx.Module):
         )
 
     def __call__(self, x: Float[Array, "member batch in"]) -> Float[Array, "member batch out"]:
+        """Apply each member's layer to its own inputs."""
         return x @ self.weight + self.bias[:, None, :]
 
 
@@ -89,6 +90,7 @@ class DenseHeads(eqx.Module):
         )
 
     def __call__(self, x: Float[Array, "member batch in"]) -> Float[Array, "member head batch out"]:
+        """Apply every head to its member's inputs, in one product."""
         members, heads, in_size, out_size = self.weight.shape
         stacked = self.weight.transpose(0, 2, 1, 3).reshape(members, in_size, heads * out_size)
         out = (x @ stacked).reshape(members, -1, heads, out_size)

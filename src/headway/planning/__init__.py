@@ -1,0 +1,1 @@
+"""How it acts: imagined returns, head selection, optimizers, the agent."""

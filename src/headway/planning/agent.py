@@ -107,9 +107,7 @@ def _act(
     return state, Decision(action, heads, plan.failures)
 
 
-def encode(
-    agent: Agent, recent: RecentTransitions
-) -> Float[Array, "member env context"] | None:
+def encode(agent: Agent, recent: RecentTransitions) -> Float[Array, "member env context"] | None:
     """The context vector of every member and environment."""
     members = agent.model.num_members
     history = jax.tree.map(
@@ -147,9 +145,7 @@ def planning_heads(
     return jnp.broadcast_to(jnp.arange(num_heads), (*heads.shape, num_heads))
 
 
-def reset_where(
-    state: AgentState, fresh: AgentState, done: Bool[Array, " env"]
-) -> AgentState:
+def reset_where(state: AgentState, fresh: AgentState, done: Bool[Array, " env"]) -> AgentState:
     """Forget everything about the environments where an episode begins anew."""
 
     def pick(old, new):

@@ -69,7 +69,8 @@ class RecentTransitions(NamedTuple):
         first, last = -config.selection_length, None
         if config.selection_skips_newest:
             last = -1
-        slots = RecentTransitions(*(x[:, first:last] for x in self[:3]), self.count)
+        obs, action, next_obs = (x[:, first:last] for x in self[:3])
+        slots = RecentTransitions(obs, action, next_obs, self.count)
         num_slots = slots.obs.shape[1]
         available = self.count - int(config.selection_skips_newest)
         used = jnp.arange(num_slots) >= num_slots - available[:, None]
@@ -94,7 +95,8 @@ def head_errors(
     num_envs, num_slots = recent.obs.shape[:2]
     members = model.num_members
     x = network_input(task, statistics, recent.obs, recent.action)
-    x = jnp.broadcast_to(x.reshape(num_envs * num_slots, -1), (members, num_envs * num_slots, x.shape[-1]))
+    x = x.reshape(num_envs * num_slots, -1)
+    x = jnp.broadcast_to(x, (members, *x.shape))
     if context is not None:
         context = jnp.repeat(context, num_slots, axis=1)
     prediction = model.forward_net(x, context)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 
 from headway import envs
-from headway.errors import ConfigError, EnvironmentFault
+from headway.errors import BadEnvironmentError, ConfigError
 from headway.report.obs_names import obs_names
 from headway.report.physics import SimParams, full_label, varying
 from headway.report.style import INK, THREAD, figure, label_axis, legend
@@ -94,13 +94,13 @@ def collect_changes(spec: EnvSpec, num_states: int, seed: int) -> Changes:
         seed: Seeds the trajectory and its actions.
 
     Raises:
-        EnvironmentFault: The environment's state cannot be copied.
+        BadEnvironmentError: The environment's state cannot be copied.
     """
     environment = envs.make(spec.name)
     world: Any = environment.unwrapped
     for method in ("get_state", "set_state", "set_sim_params", "observation"):
         if not hasattr(world, method):
-            raise EnvironmentFault(
+            raise BadEnvironmentError(
                 f"{spec.name} has no method {method}, allowed: environments with get_state,"
                 " set_state, set_sim_params and observation; add them to draw its dynamics."
             )

@@ -163,7 +163,8 @@ def _returns(rows: Sequence[EpisodeRow]) -> Facts:
 
 
 def _cells(facts: Facts, with_score: bool) -> list[str]:
-    cells = [str(facts["episodes"]), f"{facts['return_mean']:,.1f} ± {facts['return_std']:,.1f}"]
+    spread = f" ± {facts['return_std']:,.1f}" if facts["episodes"] > 1 else ""
+    cells = [str(facts["episodes"]), f"{facts['return_mean']:,.1f}{spread}"]
     if with_score:
         cells.append("–" if facts["score"] is None else f"{facts['score']:.2f}")
     return cells

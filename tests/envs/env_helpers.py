@@ -1,0 +1,55 @@
+"""What the tests of the environments share."""
+
+import numpy as np
+
+from headway import envs
+from headway.tasks.catalog import env_spec
+
+NAMES = (
+    "pendulum",
+    "cartpole-swingup",
+    "hopper",
+    "slim-humanoid",
+    "half-cheetah",
+    "crippled-ant",
+)
+ROBOTS = NAMES[2:]
+
+
+def actions_of(name: str, style: str, steps: int, seed: int = 0) -> np.ndarray:
+    """Sequences a planner might try: random, at the bounds, smooth, or at rest."""
+    space = envs.make(name).action_space
+    rng, size = np.random.default_rng(seed), space.shape[0]
+    if style == "random":
+        raw = rng.uniform(-1, 1, (steps, size))
+    elif style == "extreme":
+        raw = np.sign(rng.standard_normal((steps, size)))
+    elif style == "sine":
+        phase = rng.uniform(0, 2 * np.pi, size)
+        raw = np.sin(0.3 * np.arange(steps)[:, None] + phase)
+    else:
+        raw = np.zeros((steps, size))
+    return (space.low + 0.5 * (raw + 1) * (space.high - space.low)).astype(np.float32)
+
+
+def record(env, actions, **reset):
+    """Run an episode; return observations, actions and rewards as arrays."""
+    obs = [env.reset(**reset)[0]]
+    rewards = []
+    for action in actions:
+        step = env.step(action)
+        obs.append(step[0])
+        rewards.append(step[1])
+    return np.array(obs), np.array(actions), np.array(rewards)
+
+
+def all_physics(name: str) -> list[dict[str, float]]:
+    """Every training and unseen physics of an environment."""
+    sets = env_spec(name).sim_params
+    return [values for group in sets.group_names for values in sets.group(group)]
+
+
+def distinct_physics(name: str, number: int) -> dict[str, np.ndarray]:
+    """Different physics for each of some environments."""
+    rows = [all_physics(name)[i % len(all_physics(name))] for i in range(number)]
+    return {key: np.array([row[key] for row in rows]) for key in rows[0]}

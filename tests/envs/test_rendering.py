@@ -1,0 +1,88 @@
+"""Pictures without a screen."""
+
+import ctypes.util
+
+import numpy as np
+import pytest
+from env_helpers import NAMES, ROBOTS, actions_of
+
+from headway import envs
+from headway.envs import rendering
+from headway.errors import BadEnvironmentError
+
+HAS_OPENGL = any(ctypes.util.find_library(name) for name in ("EGL", "OSMesa"))
+needs_opengl = pytest.mark.skipif(not HAS_OPENGL, reason="no EGL or OSMesa library installed")
+PICTURED = [pytest.param(n, marks=needs_opengl if n in ROBOTS else ()) for n in NAMES]
+
+
+@pytest.mark.parametrize("name", PICTURED)
+def test_frames(name):
+    env = envs.make(name, render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    assert first.shape == (480, 640, 3)
+    assert first.dtype == np.uint8
+    assert first.std() > 5  # something is drawn
+    for action in actions_of(name, "extreme", 12):
+        env.step(action)
+    assert np.abs(env.render().astype(int) - first).max() > 50  # and it moved
+    env.close()
+    env.close()
+
+
+@pytest.mark.parametrize("name", PICTURED)
+def test_drawing_changes_nothing(name):
+    actions, ends = actions_of(name, "random", 8), []
+    for draw in (False, True):
+        env = envs.make(name, render_mode="rgb_array" if draw else None)
+        env.reset(seed=0)
+        for action in actions:
+            obs = env.step(action)[0]
+            env.render()
+        ends.append(obs)
+        env.close()
+    np.testing.assert_array_equal(*ends)
+
+
+@needs_opengl
+def test_the_camera_follows():
+    env = envs.make("half-cheetah", render_mode="rgb_array")
+    env.reset(seed=0)
+    state = env.unwrapped.get_state()
+    state[0] += 50.0
+    env.unwrapped.set_state(state)
+    frame = env.render().astype(int)
+    blue = (frame[..., 2] - frame[..., 0]) > 60  # the torso
+    columns = np.flatnonzero(blue.any(0))
+    assert 150 < columns.mean() < 490
+    env.close()
+
+
+def test_without_a_mode_nothing_is_drawn():
+    for name in NAMES:
+        env = envs.make(name)
+        env.reset(seed=0)
+        assert env.unwrapped.render() is None
+
+
+def test_the_error_names_the_package(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(rendering.sys, "platform", "linux")
+    monkeypatch.setattr(rendering.ctypes.util, "find_library", lambda name: None)
+    env = envs.make("hopper", render_mode="rgb_array")
+    env.reset(seed=0)
+    with pytest.raises(BadEnvironmentError, match="apt-get install libegl1") as caught:
+        env.render()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "installed", "library"),
+    [("", {"EGL", "OSMesa"}, "egl"), ("", {"OSMesa"}, "osmesa"), ("OSMesa", {"EGL"}, "osmesa")],
+)
+def test_choice_of_library(monkeypatch, chosen, installed, library):
+    monkeypatch.setenv("MUJOCO_GL", chosen)
+    monkeypatch.setattr(rendering.sys, "platform", "linux")
+    found = {name: f"lib{name}.so" for name in installed}
+    monkeypatch.setattr(rendering.ctypes.util, "find_library", found.get)
+    assert rendering.opengl_library() == library

@@ -1,0 +1,58 @@
+import json
+
+import numpy as np
+import pytest
+
+from headway.errors import ConfigError, UnknownNameError
+from headway.sim_params import SimParamSets
+
+SETS = SimParamSets(
+    {"mass": (1.0, 2.0), "length": (0.5,)},
+    {"low": {"mass": (0.1, 0.2), "length": (0.5, 0.6)}},
+)
+
+
+def test_groups_are_all_combinations():
+    assert SETS.group_names == ("train", "low")
+    assert SETS.group("train") == [{"mass": 1.0, "length": 0.5}, {"mass": 2.0, "length": 0.5}]
+    assert len(SETS.group("low")) == 4
+    with pytest.raises(UnknownNameError, match="Did you mean 'low'"):
+        SETS.group("lov")
+
+
+def test_sample_is_uniform_and_independent():
+    sets = SimParamSets({"a": (1.0, 2.0), "b": (3.0, 4.0)})
+    rng = np.random.default_rng(0)
+    draws = [tuple(sets.sample(rng).values()) for _ in range(2000)]
+    for pair in ((1.0, 3.0), (1.0, 4.0), (2.0, 3.0), (2.0, 4.0)):
+        assert 0.2 < draws.count(pair) / 2000 < 0.3
+
+
+def test_json_round_trip():
+    assert SimParamSets.from_dict(json.loads(json.dumps(SETS.to_dict()))) == SETS
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"train": {}},
+        {"train": {"mass": []}},
+        {"train": {"mass": 1.0}},
+        {"train": {"mass": [float("nan")]}},
+        {"train": {"mass": [float("inf")]}},
+        {"train": {"mass": ["1"]}},
+        {"train": {"mass": [True]}},
+        {"train": {"mass": [1.0]}, "unsen": {}},
+        {"train": {"mass": [1.0]}, "unseen": [1]},
+        {"train": {"mass": [1.0]}, "unseen": {"train": {"mass": [1.0]}}},
+        {"train": {"mass": [1.0]}, "unseen": {"low": {"mas": [1.0]}}},
+        {"train": {"mass": [1.0], "l": [1.0]}, "unseen": {"low": {"mass": [1.0]}}},
+        {"train": 3},
+        None,
+    ],
+)
+def test_bad_sets_are_refused_in_one_line(values):
+    with pytest.raises(ConfigError) as caught:
+        SimParamSets.from_dict(values)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,182 @@
+"""The Task says in JAX what the environment does in NumPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from env_helpers import NAMES, actions_of, all_physics, record
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from headway import envs
+from headway.errors import ConfigError
+from headway.sim_params import SimParamSets
+from headway.tasks.catalog import EnvSpec, env_names, env_spec, register
+from headway.tasks.classic import PendulumTask
+from headway.tasks.locomotion import HalfCheetahTask, HopperTask, SlimHumanoidTask
+
+
+def task_of(name, **options):
+    spec = env_spec(name)
+    return spec.make_task(**{**spec.options, **options})
+
+
+TASKS = {name: task_of(name) for name in NAMES} | {
+    "hopper as released": task_of("hopper", observe_average_velocity=False)
+}
+
+
+@pytest.mark.parametrize("style", ["random", "extreme", "sine", "rest"])
+@pytest.mark.parametrize("name", NAMES)
+def test_reward_is_what_the_environment_paid(name, style):
+    env, task = envs.make(name), TASKS[name]
+    for seed, sim_params in enumerate(all_physics(name)[:: 2 if style == "random" else 3]):
+        actions = actions_of(name, style, 60, seed)
+        reset = {"seed": seed, "options": {"sim_params": sim_params}}
+        obs, action, paid = record(env, actions, **reset)
+        with jax.enable_x64(True):
+            reward = jax.jit(task.reward)(
+                jnp.asarray(obs[:-1], jnp.float64),
+                jnp.asarray(action, jnp.float64),
+                jnp.asarray(obs[1:], jnp.float64),
+            )
+        np.testing.assert_allclose(np.asarray(reward), paid, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_reward_in_single_precision(name):
+    env, task = envs.make(name), TASKS[name]
+    obs, action, paid = record(env, actions_of(name, "random", 100), seed=0)
+    arrays = (jnp.asarray(x, jnp.float32) for x in (obs[:-1], action, obs[1:]))
+    np.testing.assert_allclose(task.reward(*arrays), paid, rtol=1e-5, atol=2e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_reward_of_actions_beyond_their_bounds(name):
+    env, task = envs.make(name), TASKS[name]
+    obs, _ = env.reset(seed=0)
+    action = np.full(task.action_size, 9.0)
+    next_obs, paid, *_ = env.step(action)
+    reward = task.reward(*(jnp.asarray(x, jnp.float32) for x in (obs, action, next_obs)))
+    np.testing.assert_allclose(reward, paid, rtol=1e-5, atol=2e-5)
+
+
+def test_termination_is_what_the_environment_said():
+    env = envs.make("cartpole-swingup", terminate_off_track=True)
+    task = task_of("cartpole-swingup", terminate_off_track=True)
+    obs, _ = env.reset(seed=0)
+    ends = []
+    for _ in range(150):
+        action = np.ones(1, np.float32)
+        next_obs, _, terminated, *_ = env.step(action)
+        arrays = (jnp.asarray(x) for x in (obs, action, next_obs))
+        assert bool(task.terminated(*arrays)) == terminated
+        ends.append(terminated)
+        obs = next_obs
+    assert any(ends)
+    assert not all(ends)
+    still = TASKS["cartpole-swingup"]
+    assert not still.terminated(jnp.zeros(5), jnp.zeros(1), jnp.full(5, 9.0))
+
+
+@pytest.mark.parametrize("name", TASKS)
+@given(data=st.data())
+def test_postprocess_undoes_target(name, data):
+    task = TASKS[name]
+    numbers = st.floats(-100, 100, width=32)
+    obs, next_obs = (
+        data.draw(arrays(np.float32, (2, task.obs_size), elements=numbers)) for _ in range(2)
+    )
+    delta = task.target(jnp.asarray(obs), jnp.asarray(next_obs))
+    np.testing.assert_allclose(
+        task.postprocess(jnp.asarray(obs), delta), next_obs, rtol=1e-5, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_sizes_and_action_units(name):
+    task = TASKS[name]
+    assert task.feature_size == task.preprocess(jnp.zeros(task.obs_size)).shape[-1]
+    assert task.feature_size == (11 if name == "hopper" else task.obs_size)
+    ends = jnp.array([[-1.0], [0.0], [1.0]]) * jnp.ones(task.action_size)
+    own = task.scale_action(ends)
+    np.testing.assert_allclose(own[0], task.action_low)
+    np.testing.assert_allclose(own[2], task.action_high)
+    np.testing.assert_allclose(task.unscale_action(own), ends, atol=1e-6)
+
+
+def test_half_cheetah_features_and_targets():
+    task = HalfCheetahTask()
+    obs, next_obs = np.arange(18.0) / 10, np.arange(18.0)[::-1] / 7
+    features = task.preprocess(jnp.asarray(obs, jnp.float32))
+    np.testing.assert_allclose(
+        features, [obs[1], np.sin(obs[2]), np.cos(obs[2]), *obs[3:]], rtol=1e-6
+    )
+    delta = task.target(jnp.asarray(obs, jnp.float32), jnp.asarray(next_obs, jnp.float32))
+    np.testing.assert_allclose(delta, [next_obs[0], *(next_obs - obs)[1:]], rtol=1e-5, atol=1e-6)
+
+
+def test_average_velocity_of_the_hopper_is_no_feature_and_predicted_itself():
+    obs, next_obs = jnp.arange(12.0), 2 * jnp.arange(12.0) + 1
+    task = HopperTask()
+    np.testing.assert_array_equal(task.preprocess(obs), obs[:11])
+    np.testing.assert_array_equal(
+        task.target(obs, next_obs), [*(next_obs - obs)[:11], next_obs[11]]
+    )
+    released = HopperTask(observe_average_velocity=False)
+    action = jnp.zeros(3)
+    assert released.reward(obs[:11], action, next_obs[:11]) == next_obs[5] + 1
+
+
+def test_released_rewards():
+    """What the released planners maximise: lags, and unscaled actions."""
+    obs, next_obs = jnp.linspace(0.1, 1.9, 45), jnp.zeros(45)
+    half = jnp.full(17, 0.2)  # half of the limit 0.4
+    humanoid = 0.25 / 0.015 * obs[22] - 0.1 * 17 * 0.25
+    got = SlimHumanoidTask().released_reward
+    np.testing.assert_allclose(got(obs, half, next_obs), humanoid, rtol=1e-5)
+    tall = obs.at[1].set(1.5)
+    np.testing.assert_allclose(got(tall, half, next_obs), humanoid + 5, rtol=1e-5)
+    cheetah = HalfCheetahTask().released_reward(obs[:18], jnp.full(6, 0.5), next_obs[:18])
+    np.testing.assert_allclose(cheetah, obs[0] - 0.1 * 6 * 0.25, rtol=1e-5)
+    hopper = HopperTask().released_reward(obs[:12], jnp.full(3, 0.5), next_obs[:12])
+    np.testing.assert_allclose(hopper, obs[5] + 1 - 1e-3 * 3 * 0.25, rtol=1e-5)
+    hanging = jnp.array([-1.0, 0.0, 2.0])
+    pendulum = PendulumTask().released_reward(hanging, jnp.array([2.0]), hanging)
+    np.testing.assert_allclose(pendulum, -(np.pi**2 + 0.4 + 0.001), rtol=1e-6)
+    for name in ("crippled-ant", "cartpole-swingup"):
+        task = TASKS[name]
+        rows = jnp.linspace(0, 1, task.obs_size), jnp.ones(task.action_size)
+        same = task.reward(*rows, rows[0] ** 2), task.released_reward(*rows, rows[0] ** 2)
+        assert same[0] == same[1]
+
+
+def test_rewards_take_any_leading_axes():
+    for task in TASKS.values():
+        obs, action = jnp.zeros((4, 3, task.obs_size)), jnp.zeros((4, 3, task.action_size))
+        assert task.reward(obs, action, obs).shape == (4, 3)
+        assert task.released_reward(obs, action, obs).shape == (4, 3)
+        assert task.terminated(obs, action, obs).shape == (4, 3)
+
+
+def test_catalog_lists_the_six():
+    assert tuple(env_names())[:6] == NAMES or set(NAMES) <= set(env_names())
+    groups = {name: env_spec(name).sim_params.group_names[1:] for name in NAMES}
+    assert groups.pop("crippled-ant") == ("leg-3",)
+    assert all(names == ("low", "high") for names in groups.values())
+    assert [env_spec(name).epochs for name in NAMES] == [5, 50, 50, 50, 50, 50]
+    lengths = [env_spec(name).episode_length for name in NAMES]
+    assert lengths == [200, 500, 500, 1000, 1000, 1000]
+
+
+def test_register_refuses_what_contradicts_itself():
+    sets = SimParamSets({"mass": (1.0,)})
+
+    def spec(name="own", length=10, **defaults):
+        return EnvSpec(name, "own/Env-v0", PendulumTask, sets, length, defaults)
+
+    for bad in (spec("hopper", mass=1.0), spec(length=0, mass=1.0), spec(masses=1.0)):
+        with pytest.raises(ConfigError):
+            register(bad)
+    assert "own" not in env_names()
