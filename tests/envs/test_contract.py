@@ -3,11 +3,11 @@
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from env_helpers import NAMES, ROBOTS, actions_of, all_physics, record
+from gymnasium.utils.env_checker import check_env
 
 from headway import envs
-from headway.errors import ConfigError, BadEnvironmentError, UnknownNameError
+from headway.errors import BadEnvironmentError, ConfigError, UnknownNameError
 from headway.sim_params import SimParamSets
 from headway.tasks.catalog import env_spec
 
@@ -28,6 +28,7 @@ def env(name):
 
 @pytest.mark.filterwarnings("ignore:.*Box observation space (min|max)imum value is")
 @pytest.mark.filterwarnings("ignore:.*Not able to test alternative render modes")
+@pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space")
 @pytest.mark.filterwarnings("error")
 def test_gymnasium_accepts_it(env):
     check_env(env.unwrapped, skip_render_check=True)
@@ -128,16 +129,14 @@ def test_set_sim_params_keeps_the_state(env, name):
     assert env.unwrapped.sim_params == all_physics(name)[-1]
 
 
-@pytest.mark.parametrize("value", [0.0, -0.5, np.nan, np.inf, "heavy", None, 5.0])
+@pytest.mark.parametrize("value", [-0.5, np.nan, np.inf, "heavy", None])
 def test_bad_values_are_refused(env, name, value):
     key = next(iter(env_spec(name).default_sim_params))
-    if value == 5.0 and name != "crippled-ant":
-        pytest.skip("5 is allowed here")
-    if value == 0.0 and name == "crippled-ant":
-        pytest.skip("leg 0 exists")
-    with pytest.raises(ConfigError, match="allowed") as caught:
-        env.reset(options={"sim_params": {key: value}})
-    assert "\n" not in str(caught.value)
+    edge = 4.0 if name == "crippled-ant" else 0.0
+    for bad in (value, edge):
+        with pytest.raises(ConfigError, match="allowed") as caught:
+            env.reset(options={"sim_params": {key: bad}})
+        assert "\n" not in str(caught.value)
 
 
 def test_unknown_names_are_refused_with_a_hint(env, name):
@@ -188,7 +187,8 @@ def test_time_limit(env, name):
     assert ends == [(False, False), (False, False), (False, True)]
 
 
-def test_a_simulation_that_diverges_is_told():
+def test_a_simulation_that_diverges_is_told(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log there
     env = envs.make("half-cheetah")
     env.reset(seed=0)
     state = env.unwrapped.get_state()

@@ -1,5 +1,8 @@
 """Numbers worked out by hand from the sources, one environment at a time."""
 
+from pathlib import Path
+
+import gymnasium
 import mujoco
 import numpy as np
 import pytest
@@ -234,6 +237,23 @@ def test_masses_of_the_models():
     assert load_model("half_cheetah.xml").body_mass.sum() == pytest.approx(14.0)
     assert load_model("ant.xml").body_mass.sum() == pytest.approx(0.9109, abs=1e-4)
     assert load_model("humanoid.xml").body_mass.sum() == pytest.approx(42.116, abs=1e-3)
+
+
+@pytest.mark.parametrize("xml", ["hopper.xml", "humanoid.xml", "half_cheetah.xml", "ant.xml"])
+def test_models_are_gymnasiums_but_for_their_looks(xml, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs what it deprecates
+    assets = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+    plain, ours = mujoco.MjModel.from_xml_path(str(assets / xml)), load_model(xml)
+    looks = ("geom_rgba", "geom_matid", "mat_", "tex_", "light_")
+    compared = 0
+    for field in dir(plain):
+        value = getattr(plain, field)
+        if isinstance(value, np.ndarray) and not field.startswith(looks):
+            np.testing.assert_array_equal(getattr(ours, field), value, err_msg=field)
+            compared += 1
+    assert compared > 100
+    for field in ("timestep", "integrator", "solver", "iterations", "tolerance"):
+        assert getattr(ours.opt, field) == getattr(plain.opt, field)
 
 
 def test_loading_the_models_warns_of_nothing(capfd, tmp_path, monkeypatch):

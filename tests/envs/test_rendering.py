@@ -32,7 +32,7 @@ def test_frames(name):
 
 @pytest.mark.parametrize("name", PICTURED)
 def test_drawing_changes_nothing(name):
-    actions, ends = actions_of(name, "random", 8), []
+    actions, ends = actions_of(name, "random", 3), []
     for draw in (False, True):
         env = envs.make(name, render_mode="rgb_array" if draw else None)
         env.reset(seed=0)

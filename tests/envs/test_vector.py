@@ -3,12 +3,12 @@
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
 from env_helpers import NAMES, all_physics, distinct_physics
+from gymnasium.vector import AutoresetMode
 
 from headway import envs
 from headway.envs import ClassicVectorEnv, RolloutVectorEnv, SequentialVectorEnv
-from headway.errors import ConfigError, BadEnvironmentError, UnknownNameError
+from headway.errors import BadEnvironmentError, ConfigError, UnknownNameError
 from headway.sim_params import SimParamSets
 from headway.tasks import catalog
 from headway.tasks.catalog import EnvSpec, env_spec, register
@@ -188,7 +188,8 @@ def test_bad_arguments_are_refused():
         SequentialVectorEnv([])
 
 
-def test_a_simulation_that_diverges_is_told():
+def test_a_simulation_that_diverges_is_told(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log there
     vector = envs.make_vec("half-cheetah", 3)
     vector.reset(seed=0)
     vector._state[1, 0, 10:19] = 1e12

@@ -44,10 +44,10 @@ class LocomotionEnv(WorldEnv):
         """
         robot, data = self._world, self.data
         action = robot.clip(action, (self.model.nu,))
-        before, time = self._robot_state(), data.time
+        before = self._robot_state()
         data.ctrl[:] = robot.control(action, self._sim_params)
         mujoco.mj_step(self.model, data, nstep=robot.frame_skip)
-        robot.check_clock(data.time - time, self._sim_params)
+        robot.check_warnings(data, self._sim_params)
         after = robot.after_step(before, data.qpos.copy(), data.qvel.copy())
         self._velocity = float(after.velocity)
         reward = float(robot.reward(before, action, after))

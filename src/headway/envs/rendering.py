@@ -72,10 +72,8 @@ class OffscreenRenderer:
     """
 
     def __init__(self, model: mujoco.MjModel, camera: Camera):
-        self._context: Any = _new_context()
-        self._context.make_current()
         model.vis.global_.offwidth, model.vis.global_.offheight = WIDTH, HEIGHT
-        self._mjr = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        self._context, self._mjr = _new_contexts(model)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr)
         self._scene = mujoco.MjvScene(model, maxgeom=1000)
         self._options = mujoco.MjvOption()
@@ -130,12 +128,14 @@ def opengl_library() -> str:
     raise _no_opengl("neither EGL nor OSMesa is installed")
 
 
-def _new_context() -> Any:
-    """Make an OpenGL context without a window."""
+def _new_contexts(model: mujoco.MjModel) -> tuple[Any, mujoco.MjrContext]:
+    """Make an OpenGL context without a window, and MuJoCo's own inside it."""
     library = opengl_library()
     name = f"mujoco.{library}" if library in _LIBRARIES else "mujoco.gl_context"
     try:
-        return importlib.import_module(name).GLContext(WIDTH, HEIGHT)
+        context = importlib.import_module(name).GLContext(WIDTH, HEIGHT)
+        context.make_current()
+        return context, mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
     except Exception as error:  # each library fails with errors of its own
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise _no_opengl(f"{library} failed: {reason}") from error

@@ -83,16 +83,17 @@ class Robot(World):
         velocity = (qpos[..., 0] - before.qpos[..., 0]) / self.time_step
         return RobotState(qpos, qvel, velocity)
 
-    def check_clock(self, elapsed: float, sim_params: Mapping[str, float]) -> None:
-        """Notice that MuJoCo met a non-finite or huge number and started over.
+    def check_warnings(self, data: mujoco.MjData, sim_params: Mapping[str, Any]) -> None:
+        """Notice that MuJoCo gave up on a state; it would quietly start over from the nominal.
 
         Raises:
-            BadEnvironmentError: A control step took less than its time.
+            BadEnvironmentError: MuJoCo warned of non-finite or huge numbers, or of full buffers.
         """
-        if elapsed < self.time_step - 0.5 * self.nominal.opt.timestep:
+        if data.warning.number.any():
+            physics = {name: float(value) for name, value in sim_params.items()}
             raise BadEnvironmentError(
-                f"the simulation of {self.name} diverged under sim_params {dict(sim_params)},"
-                " allowed: finite states; use less extreme sim_params."
+                f"the simulation of {self.name} diverged under sim_params {physics}, allowed:"
+                " finite states; use less extreme sim_params."
             )
 
 

@@ -98,13 +98,13 @@ class RolloutVectorEnv(WorldVectorEnv):
 
     def _advance(self, active: np.ndarray, actions: np.ndarray) -> Outcome:
         robot = self._world
-        before, time = self._robot_state(), self._state[:, 0, 0].copy()
+        before = self._robot_state()
         self._control[:] = robot.control(actions, self._sim_params)[:, None, None]
         self._roll_out(active)
         self._state[active] = self._states[active, :, -1]
         for i in active:
-            sim_params = {name: float(values[i]) for name, values in self._sim_params.items()}
-            robot.check_clock(self._state[i, 0, 0] - time[i], sim_params)
+            sim_params = {name: values[i] for name, values in self._sim_params.items()}
+            robot.check_warnings(self._datas[i], sim_params)
         after = robot.after_step(before, *self._positions())
         self._velocity[active] = after.velocity[active]
         reward = robot.reward(before, actions, after)

@@ -1,0 +1,71 @@
+"""What the README and the guides show works as it stands there."""
+
+import re
+from pathlib import Path
+
+import gymnasium
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import headway
+from headway.tasks import catalog
+
+ROOT = Path(__file__).parent.parent
+
+
+def python_blocks(path: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (ROOT / path).read_text(), re.DOTALL)
+
+
+def test_readme_python(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (code,) = python_blocks("README.md")
+    assert len([line for line in code.splitlines() if line]) <= 12
+    exec(compile(code, "README.md", "exec"), {})
+    assert "'length': 1.75" in capsys.readouterr().out
+    assert (tmp_path / "runs/readme/figures/learning_curve.png").exists()
+
+
+class Cart(gymnasium.Env):
+    """The environment that docs/own-environment.md speaks of."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = gymnasium.spaces.Box(-3, 3, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.mass = (options or {}).get("sim_params", {"mass": 1.0})["mass"]
+        self.state = self.np_random.uniform(-1, 1, 2)
+        return self.state.astype(np.float32), {"sim_params": {"mass": self.mass}}
+
+    def step(self, action):
+        position, velocity = self.state
+        velocity = velocity + 0.1 * float(action[0]) / self.mass
+        self.state = np.array([position + 0.1 * velocity, velocity])
+        reward = -float(self.state[0] ** 2) - 0.01 * float(action[0]) ** 2
+        return self.state.astype(np.float32), reward, False, False, {}
+
+
+@pytest.fixture
+def cart(monkeypatch):
+    monkeypatch.setattr(catalog, "_SPECS", dict(catalog._SPECS))
+    gymnasium.register("my_package/Cart-v0", Cart)
+    yield
+    del gymnasium.registry["my_package/Cart-v0"]
+
+
+@pytest.mark.usefixtures("cart")
+def test_own_environment_guide(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (code,) = python_blocks("docs/own-environment.md")
+    names: dict = {}
+    exec(compile(code.replace('"quick"', '"smoke"'), "own-environment.md", "exec"), names)
+    run = names["run"]
+    assert {row.group for row in run.evaluation} == {"train", "heavy"}
+    obs = np.array([0.5, 0.0], np.float32)
+    action = headway.load(run.path).act(obs)
+    assert action.shape == (1,)
+    assert np.abs(action) <= 3
+    task = headway.env_spec("cart").make_task()
+    assert jnp.isclose(task.reward(obs, jnp.array([1.0]), jnp.array([0.5, 0.1])), -0.26)
