@@ -1,5 +1,6 @@
 """Losses against NumPy twins, and what must hold of any oracle."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -196,9 +197,11 @@ def random_batch(seed, samples=6, members=2):
 
 
 def gradient(model, owners, batch, config):
-    statistics = toys.odd_statistics()
+    return compiled_gradient(model, owners, batch, config, toys.odd_statistics())
 
-    @jax.jit
+
+@eqx.filter_jit
+def compiled_gradient(model, owners, batch, config, statistics):
     def objective(model):
         losses = head_losses(model, toys.POINT, statistics, batch)
         return total_loss(model, losses, owners, batch.weight, config)[0]

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,18 +32,18 @@ def remember(pushes, *, num_slots=SLOTS):
     return recent
 
 
+@eqx.filter_jit
+def errors_and_use(model, statistics, recent, config):
+    slots, used = recent.newest(config)
+    sampling = jax.random.key(7) if config.selection_error == "sampled" else None
+    errors = head_errors(model, toys.POINT, statistics, slots, None, sampling_key=sampling)
+    return errors, used
+
+
 def choose(pushes, *, model=MODEL, statistics=None, key=0, **settings):
     config = PlannerConfig(**settings)
-    slots, used = remember(pushes).newest(config)
-    sampled = config.selection_error == "sampled"
-    errors = head_errors(
-        model,
-        toys.POINT,
-        statistics or toys.identity_statistics(),
-        slots,
-        None,
-        sampling_key=jax.random.key(7) if sampled else None,
-    )
+    statistics = statistics or toys.identity_statistics()
+    errors, used = errors_and_use(model, statistics, remember(pushes), config)
     return select_heads(errors, used, key=jax.random.key(key))[0].tolist()
 
 

@@ -1,5 +1,6 @@
 """What every optimizer must keep to, and how well each searches a problem with a known answer."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,23 +38,43 @@ def towards(target):
     return score
 
 
-def spoil(score, where, value):
-    """The same score, but `value` where the condition on the candidates holds."""
-    return lambda candidates, key: jnp.where(where(candidates), value, score(candidates, key))
+@eqx.filter_jit
+def optimize(optimizer, target, guess, bad, bad_envs, bad_if_positive, key):
+    def score(candidates, key):
+        spoiled = bad_envs[:, None] | (bad_if_positive & (candidates[..., 0, 0] > 0))
+        return jnp.where(spoiled, bad, towards(target)(candidates, key))
+
+    return optimizer.optimize(score, guess, key=key)
 
 
-def env_is(number):
-    return lambda candidates: (jnp.arange(NUM_ENVS) == number)[:, None]
+def search(optimizer, target, *, guess=None, bad=0.0, bad_envs=(), bad_if_positive=False, key=0):
+    """Search for `target`; some candidates or all of some environments have a `bad` return."""
+    return optimize(
+        optimizer,
+        jnp.asarray(target),
+        start() if guess is None else guess,
+        jnp.asarray(bad),
+        jnp.asarray([env in bad_envs for env in range(NUM_ENVS)]),
+        jnp.asarray(bad_if_positive),
+        jax.random.key(key),
+    )
 
 
-@pytest.mark.parametrize("guess", [0.0, 0.97, -1.0])
-def test_plans_and_candidates_stay_within_bounds_and_shape(optimizer, guess):
+@eqx.filter_jit
+def push_outwards(optimizer, guess, key):
+    """Search for the largest action; the return is at most 1 if no candidate is beyond bounds."""
+
     def largest(candidates, key):
         del key
         assert candidates.shape == (NUM_ENVS, 40, HORIZON, ACTIONS)
         return jnp.abs(candidates).max((-1, -2))
 
-    plan = optimizer.optimize(largest, start(guess), key=KEY)
+    return optimizer.optimize(largest, guess, key=key)
+
+
+@pytest.mark.parametrize("guess", [0.0, 0.97, -1.0])
+def test_plans_and_candidates_stay_within_bounds_and_shape(optimizer, guess):
+    plan = push_outwards(optimizer, start(guess), KEY)
     assert plan.actions.shape == (NUM_ENVS, HORIZON, ACTIONS)
     assert plan.expected_return.shape == plan.failures.shape == (NUM_ENVS,)
     assert np.abs(np.asarray(plan.actions)).max() <= 1.0
@@ -62,16 +83,14 @@ def test_plans_and_candidates_stay_within_bounds_and_shape(optimizer, guess):
 
 
 def test_search_moves_towards_each_environments_own_optimum(optimizer):
-    plan = optimizer.optimize(towards([0.6, -0.6]), start(), key=KEY)
-    means = np.asarray(plan.actions).mean((1, 2))
+    means = np.asarray(search(optimizer, [0.6, -0.6]).actions).mean((1, 2))
     assert means[0] > 0.2
     assert means[1] < -0.2
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_non_finite_candidate_never_wins_nor_is_an_elite(optimizer, bad):
-    score = spoil(towards([0.9, 0.9]), lambda x: x[..., 0, 0] > 0, bad)
-    plan = optimizer.optimize(score, start(), key=KEY)
+    plan = search(optimizer, [0.9, 0.9], bad=bad, bad_if_positive=True)
     assert (np.asarray(plan.actions)[:, 0, 0] <= 0).all()
     assert np.isfinite(plan.expected_return).all()
     np.testing.assert_array_equal(plan.failures, 0)
@@ -82,9 +101,8 @@ def test_when_nothing_is_finite_the_guess_is_kept_and_counted_in_that_environmen
     optimizer, bad
 ):
     guess = start(0.25).at[:, 1].set(-0.5)
-    score = towards([0.5, 0.5])
-    healthy = optimizer.optimize(score, guess, key=KEY)
-    plan = optimizer.optimize(spoil(score, env_is(0), bad), guess, key=KEY)
+    healthy = search(optimizer, [0.5, 0.5], guess=guess)
+    plan = search(optimizer, [0.5, 0.5], guess=guess, bad=bad, bad_envs=[0])
     np.testing.assert_array_equal(plan.actions[0], guess[0])
     np.testing.assert_array_equal(plan.failures, [ROUNDS, 0])
     np.testing.assert_array_equal(plan.actions[1], healthy.actions[1])
@@ -93,23 +111,20 @@ def test_when_nothing_is_finite_the_guess_is_kept_and_counted_in_that_environmen
 
 
 def test_environments_do_not_see_each_other(optimizer):
-    first = optimizer.optimize(towards([0.5, -0.3]), start(), key=KEY)
-    second = optimizer.optimize(towards([-0.9, -0.3]), start().at[0].set(0.4), key=KEY)
+    first = search(optimizer, [0.5, -0.3])
+    second = search(optimizer, [-0.9, -0.3], guess=start().at[0].set(0.4))
     np.testing.assert_array_equal(first.actions[1], second.actions[1])
     assert (first.actions[0] != second.actions[0]).any()
 
 
 def test_same_key_same_plan_and_another_key_another(optimizer):
-    plans = [
-        optimizer.optimize(towards([0.5, -0.3]), start(), key=jax.random.key(k)).actions
-        for k in (1, 1, 2)
-    ]
+    plans = [search(optimizer, [0.5, -0.3], key=key).actions for key in (1, 1, 2)]
     np.testing.assert_array_equal(plans[0], plans[1])
     assert (plans[0] != plans[2]).any()
 
 
 def test_environments_draw_different_candidates(optimizer):
-    plan = optimizer.optimize(towards([0.5, 0.5]), start(), key=KEY)
+    plan = search(optimizer, [0.5, 0.5])
     assert (plan.actions[0] != plan.actions[1]).any()
 
 
@@ -198,9 +213,12 @@ def test_cem_beats_random_shooting_with_as_many_candidates_and_nears_the_optimum
     cem = CEM(num_candidates=200, num_elites=20, num_iterations=8)
     shooting = RandomShooting(num_candidates=200, num_iterations=8)
 
+    @eqx.filter_jit
+    def plan(optimizer, key):
+        return score(optimizer.optimize(score, guess, key=key).actions[:, None], None)
+
     def achieved(optimizer, key):
-        plan = optimizer.optimize(score, guess, key=jax.random.key(key))
-        return np.asarray(score(plan.actions[:, None], None))[:, 0]
+        return np.asarray(plan(optimizer, jax.random.key(key)))[:, 0]
 
     idle = np.asarray(score(guess[:, None], None))[:, 0]
     for key in range(3):

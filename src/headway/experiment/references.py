@@ -52,7 +52,8 @@ def score(
     if env not in _TABLES:
         return None
     name, full_length, table = _TABLES[env]
-    if length != full_length or sim_params.get(name) not in table:
+    others_nominal = all(value == 1.0 for other, value in sim_params.items() if other != name)
+    if length != full_length or sim_params.get(name) not in table or not others_nominal:
         return None
     random, ceiling = table[sim_params[name]]
     return (episode_return - random) / (ceiling - random)
