@@ -65,7 +65,7 @@ def test_epoch(timed, report):
     each = timing.seconds / updates
     report.add(f"fitted epoch of {updates} updates, heads assigned", timing.seconds, "s")
     report.add(
-        f"one update of {MODEL.num_members} x {FITTING.batch_size}, as a share of that epoch",
+        f"  one update of {MODEL.num_members} x {FITTING.batch_size}: its share",
         1e3 * each,
         "ms",
         **timing.ratio(update_flop(state.model), each),

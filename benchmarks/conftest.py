@@ -107,7 +107,7 @@ class Timing:
 
     def ratio(self, flop: float, seconds: float | None = None) -> dict[str, Any]:
         """Columns `ratio` and `ratio_to` of the table, for `seconds` or else the median."""
-        products = f"{flop / 1e9:.3g} GFLOP of NumPy products at {self.rate / 1e9:.0f} GFLOP/s"
+        products = f"{flop / 1e9:,.1f} GFLOP of NumPy products at {self.rate / 1e9:.0f} GFLOP/s"
         seconds = self.seconds if seconds is None else seconds
         return {"ratio": seconds * self.rate / flop, "ratio_to": products}
 

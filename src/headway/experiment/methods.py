@@ -98,6 +98,7 @@ def _released_code(spec: EnvSpec) -> Settings:
 
 def _quick(spec: EnvSpec) -> Settings:
     return {
+        "model.hidden_sizes": (128, 128, 128, 128),
         "collection.num_iterations": 5,
         "collection.num_episodes": 5,
         "collection.episode_length": min(spec.episode_length, 200),
@@ -136,7 +137,7 @@ def _smoke(spec: EnvSpec) -> Settings:
 
 _PRESETS = (
     Preset("paper", "the supplement's numbers; hours on a GPU, days on a CPU", _paper),
-    Preset("quick", "a reduced planner and schedule; minutes on a laptop", _quick),
+    Preset("quick", "a smaller network, planner and schedule; minutes on a laptop", _quick),
     Preset("smoke", "tiny sizes that only show that everything runs; seconds", _smoke),
     Preset(
         "released-code",

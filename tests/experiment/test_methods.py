@@ -1,0 +1,94 @@
+"""The table of methods and presets, scores, and the rows of a run's tables."""
+
+import pytest
+
+from headway.errors import ConfigError, UnknownNameError
+from headway.experiment.evaluation import group_episodes
+from headway.experiment.methods import METHODS, PRESETS, make_config
+from headway.experiment.references import score
+from headway.experiment.runs import format_sim_params, parse_sim_params
+from headway.tasks.catalog import env_names, env_spec
+
+
+@pytest.mark.parametrize("env", env_names())
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("method", METHODS)
+def test_every_combination_is_a_valid_configuration(env, preset, method):
+    config = make_config(env, method=method, preset=preset)
+    assert (config.env, config.method, config.preset) == (env, method, preset)
+
+
+def test_paper_preset_has_the_supplements_numbers():
+    config = make_config("half-cheetah")
+    planner, fitting, collection = config.planner, config.fitting, config.collection
+    assert (planner.num_candidates, planner.num_iterations, planner.horizon) == (200, 5, 30)
+    assert (planner.num_particles, planner.selection_length) == (20, 10)
+    assert (config.model.num_members, config.model.num_heads) == (5, 3)
+    assert config.model.hidden_sizes == (200, 200, 200, 200)
+    assert (fitting.segment_length, fitting.warmup_iterations, fitting.learning_rate) == (10, 3, 1e-3)
+    assert (collection.num_iterations, collection.num_episodes) == (10, 10)
+    assert fitting.epochs == 50
+    assert make_config("pendulum").fitting.epochs == 5
+    assert not fitting.bootstrap
+
+
+def test_released_code_preset_flips_the_choices_that_differ():
+    config = make_config("hopper", preset="released-code")
+    assert config.fitting.bootstrap
+    assert config.fitting.drop_first_anchor
+    assert not config.fitting.context_weight_decay
+    assert config.planner.selection_error == "sampled"
+    assert config.planner.selection_skips_newest
+    assert config.planner.reward == "released"
+    assert config.env_options == {"observe_average_velocity": False}
+
+
+def test_method_wins_over_preset_and_user_over_both():
+    vanilla = make_config("pendulum", method="vanilla", preset="quick")
+    assert vanilla.planner.num_particles == 1
+    changed = make_config(
+        "pendulum", method="vanilla", preset="quick", settings={"planner.num_particles": 4}
+    )
+    assert changed.planner.num_particles == 4
+
+
+@pytest.mark.parametrize(
+    ("kind", "wrong", "right"),
+    [("method", "tmlc", "tmcl"), ("preset", "quik", "quick"), ("env", "pendulm", "pendulum")],
+)
+def test_unknown_names_suggest_the_closest(kind, wrong, right):
+    arguments = {"env": "pendulum", kind: wrong}
+    with pytest.raises(UnknownNameError, match=f"Did you mean '{right}'"):
+        make_config(**arguments)
+
+
+def test_unknown_environment_option_is_refused():
+    with pytest.raises(ConfigError, match="terminate_off_track"):
+        make_config("cartpole-swingup", settings={"env_options": {"terminate_off_trak": True}})
+
+
+@pytest.mark.parametrize("env", env_names())
+def test_test_episodes_are_fixed_distinct_and_spread_evenly(env):
+    sets = env_spec(env).sim_params
+    groups = {group: group_episodes(sets, group, 10, 10_000) for group in sets.group_names}
+    seeds = [episode.seed for episodes in groups.values() for episode in episodes]
+    assert len(set(seeds)) == len(seeds)
+    for group, episodes in groups.items():
+        counts = [sum(e.sim_params == p for e in episodes) for p in sets.group(group)]
+        assert max(counts) - min(counts) <= 1
+    assert groups == {group: group_episodes(sets, group, 10, 10_000) for group in sets.group_names}
+
+
+def test_score_is_zero_for_random_and_one_for_the_ceiling():
+    assert score("pendulum", {"length": 0.5, "mass": 1.0}, -1501, 200) == 0
+    assert score("pendulum", {"length": 0.5, "mass": 1.0}, -126, 200) == 1
+    assert score("pendulum", {"length": 0.6, "mass": 1.0}, -126, 200) is None
+    assert score("pendulum", {"length": 0.5, "mass": 2.0}, -126, 200) is None
+    assert score("pendulum", {"length": 0.5, "mass": 1.0}, -126, 100) is None
+    assert score("hopper", {"mass_scale": 1.0}, 10, 500) is None
+
+
+def test_sim_params_survive_their_cell():
+    sim_params = {"mass_scale": 0.375, "damping_scale": 1.0}
+    assert format_sim_params(sim_params) == "damping_scale=1 mass_scale=0.375"
+    assert parse_sim_params(format_sim_params(sim_params)) == sim_params
