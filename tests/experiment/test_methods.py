@@ -25,7 +25,11 @@ def test_paper_preset_has_the_supplements_numbers():
     assert (planner.num_particles, planner.selection_length) == (20, 10)
     assert (config.model.num_members, config.model.num_heads) == (5, 3)
     assert config.model.hidden_sizes == (200, 200, 200, 200)
-    assert (fitting.segment_length, fitting.warmup_iterations, fitting.learning_rate) == (10, 3, 1e-3)
+    assert (fitting.segment_length, fitting.warmup_iterations, fitting.learning_rate) == (
+        10,
+        3,
+        1e-3,
+    )
     assert (collection.num_iterations, collection.num_episodes) == (10, 10)
     assert fitting.epochs == 50
     assert make_config("pendulum").fitting.epochs == 5

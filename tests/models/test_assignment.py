@@ -137,12 +137,12 @@ def test_what_lies_behind_an_episodes_end_changes_no_assignment():
 def test_a_sample_has_its_own_transition_but_its_anchors_history_and_head():
     trajectories = [toys.random_trajectory(n, seed=n) for n in (5, 8)]
     data = data_of(trajectories, future_length=3)
-    heads = jnp.asarray(np.random.default_rng(0).integers(0, 2, (2, 3, 4)))
+    heads = jnp.arange(24).reshape(2, 3, 4)  # all different, to tell the segments apart
     count = int(data.samples.count)
     order = jnp.tile(jnp.arange(count)[::-1], (2, 1))
     weight = jnp.ones(order.shape)
     batch, owners = gather_batch(
-        data, Assignment(heads, 1 - heads), order, weight, setup(segment_length=2)
+        data, Assignment(heads, 100 - heads), order, weight, setup(segment_length=2)
     )
     table = np.stack(data.samples[:3], axis=-1)[:count][::-1]
     assert (table[:, 2] > 0).any()
@@ -156,7 +156,7 @@ def test_a_sample_has_its_own_transition_but_its_anchors_history_and_head():
             np.testing.assert_array_equal(batch.history.action[member, i], past.action)
             np.testing.assert_array_equal(batch.history.obs_diff[member, i], past.obs_diff)
             assert owners.forward[member, i] == heads[member, episode, anchor // 2]
-            assert owners.backward[member, i] == 1 - heads[member, episode, anchor // 2]
+            assert owners.backward[member, i] == 100 - heads[member, episode, anchor // 2]
 
 
 @pytest.mark.parametrize("batch_size", [1, 4, 1000])
