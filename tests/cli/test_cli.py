@@ -8,10 +8,10 @@ import pytest
 from headway import api
 from headway.cli import main
 from headway.cli.commands import parse_train
-from headway.settings import override
 from headway.errors import RunError
 from headway.experiment.methods import METHODS, PRESETS, make_config
 from headway.experiment.runs import EpisodeRow
+from headway.settings import override
 
 
 def run(capsys, *words):

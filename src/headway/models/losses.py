@@ -28,8 +28,11 @@ def negative_log_likelihood(
 
 
 def assign_heads(losses: Float[Array, "*batch head segment"]) -> Int[Array, "*batch segment"]:
-    """Give each segment to the head of least loss; ties go to the lower index."""
-    return jnp.argmin(losses, axis=-2)
+    """Give each segment to the head of least loss; ties go to the lower index.
+
+    A head with a non-finite loss never wins over one with a finite loss.
+    """
+    return jnp.argmin(jnp.where(jnp.isfinite(losses), losses, jnp.inf), axis=-2)
 
 
 def independent_loss(

@@ -26,7 +26,8 @@ class Plan(NamedTuple):
     actions: Float[Array, "env horizon action"]
     """The chosen sequence, within [-1, 1]."""
     expected_return: Float[Array, " env"]
-    """Mean finite return of the last iteration's elites (CEM) or the best one (shooting)."""
+    """Mean return of the last iteration's finite elites (CEM) or the best return (shooting);
+    -inf where nothing was finite."""
     failures: Int[Array, " env"]
     """Iterations in which no candidate had a finite return; the old plan was kept then."""
 
@@ -76,7 +77,8 @@ class CEM(Optimizer):
             keep = jnp.where(found, self.smoothing, 1.0)
             mean = keep * mean + (1.0 - keep) * new_mean
             var = keep * var + (1.0 - keep) * new_var
-            expected = jnp.where(finite, elite_returns, 0.0).sum(-1) / finite.sum(-1)
+            total = jnp.where(finite, elite_returns, 0.0).sum(-1)
+            expected = jnp.where(finite.any(-1), total / jnp.maximum(finite.sum(-1), 1), -jnp.inf)
             return (mean, var, failures + ~found[:, 0, 0], expected), None
 
         num_envs = guess.shape[0]
@@ -126,7 +128,7 @@ class RandomShooting(Optimizer):
         carry = guess, jnp.full(num_envs, -jnp.inf), jnp.zeros(num_envs, jnp.int32)
         keys = jax.random.split(key, self.num_iterations)
         (best, best_return, failures), _ = jax.lax.scan(iterate, carry, keys)
-        return Plan(best, best_return, failures)
+        return Plan(jnp.clip(best, -1.0, 1.0), best_return, failures)
 
 
 def make_optimizer(config: PlannerConfig) -> Optimizer:
