@@ -8,7 +8,7 @@ from typing import Any
 import jax
 
 from headway.config import Config
-from headway.errors import ConfigError, unknown_name
+from headway.errors import unknown_name
 from headway.experiment.evaluation import episode_rows, evaluate_agent
 from headway.experiment.methods import make_config
 from headway.experiment.progress import Progress
@@ -91,7 +91,7 @@ def evaluate(
     Raises:
         RunError: There is no trained run, or it is damaged.
         UnknownNameError: No such group.
-        ConfigError: `num_episodes` is less than 1.
+        ConfigError: `num_episodes` is out of range.
     """
     run = RunDir(run_dir)
     config = run.config()
@@ -103,8 +103,6 @@ def evaluate(
             raise unknown_name("group", group, known)
     groups = list(dict.fromkeys(groups or known))
     if num_episodes is not None:
-        if num_episodes < 1:
-            raise ConfigError(f"num_episodes is {num_episodes}, allowed: at least 1.")
         testing = dataclasses.replace(config.evaluation, num_episodes=num_episodes)
         config = dataclasses.replace(config, evaluation=testing)
     iteration = run.finished_iterations - 1
@@ -112,7 +110,7 @@ def evaluate(
         total = len(groups) * config.evaluation.num_episodes * arena.episode_length
         shown.phase(iteration, run.finished_iterations, "evaluate", total)
         key = jax.random.key(config.evaluation.seed)
-        found = evaluate_agent(agent, arena, config, groups, key=key, on_step=shown.advance)
+        found, _ = evaluate_agent(agent, arena, config, groups, key=key, on_step=shown.advance)
     return episode_rows(config, iteration, found)
 
 

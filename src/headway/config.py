@@ -149,7 +149,7 @@ class PlannerConfig:
     num_elites: int = 50
     """Best candidates that shape the next iteration (CEM)."""
     num_iterations: int = 5
-    """Optimizer iterations per plan (CEM); random shooting draws as many candidates at once."""
+    """Optimizer iterations per plan; random shooting draws new candidates in each."""
     smoothing: float = 0.1
     """Share of the old mean and variance that is kept at each CEM iteration."""
     initial_std: float = 0.5
@@ -181,7 +181,7 @@ class PlannerConfig:
         problems.one_of("selection_error", ("mean", "sampled"))
         problems.one_of("reward", ("task", "released"))
         problems.require(
-            self.num_elites <= self.num_candidates,
+            self.num_elites <= self.num_candidates or self.optimizer != "cem",
             f"num_elites is {self.num_elites}, allowed: at most num_candidates"
             f" ({self.num_candidates})",
         )
@@ -225,8 +225,9 @@ class EvaluationConfig:
 
     def __post_init__(self):
         problems = _Problems(self)
-        problems.at_least(1, "every", "num_episodes")
-        problems.at_least(0, "seed")
+        problems.at_least(1, "every")
+        problems.between(1, 1000, "num_episodes")
+        problems.between(0, 2**30, "seed")
         problems.one_of("training_group", ("last", "always"))
         problems.report()
 

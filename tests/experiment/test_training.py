@@ -171,7 +171,7 @@ def test_damaged_checkpoint_is_named(keep, reference, tmp_path):
     damaged.write_bytes(checkpoint.read_bytes()[:keep])
     config = RunDir(reference).config()
     template = training.initial(config, training.load_task(config))
-    with pytest.raises(RunError, match="checkpoint.safetensors is damaged"):
+    with pytest.raises(RunError, match=r"checkpoint\.safetensors is damaged"):
         storage.load_tree(damaged, template)
 
 

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from headway.envs.world import SimParams, World, read_options
-from headway.errors import ConfigError
+from headway.errors import BadEnvironmentError, ConfigError
 from headway.sim_params import SimParamSets
 
 Seeds = int | Sequence[int | None] | None
@@ -37,7 +37,8 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     With `AutoresetMode.NEXT_STEP` the step after the end of an episode ignores its action,
     starts the next episode with physics drawn from the training values, and pays 0. With
-    `AutoresetMode.DISABLED` an environment goes on stepping until it is reset.
+    `AutoresetMode.DISABLED` a finished environment stands still, pays 0 and repeats its last
+    observation and flags until it is reset.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as in Gymnasium)
@@ -64,7 +65,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.metadata = self.metadata | {"autoreset_mode": mode}
         self.episode_length = episode_length
         self._elapsed = np.zeros(num_envs, int)
-        self._finished = np.zeros(num_envs, bool)
+        self._ends = np.zeros((2, num_envs), bool)
         self._sim_params: dict[str, np.ndarray] = {}
 
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -93,20 +94,26 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         actions = self._check_actions(actions)
         rewards = np.zeros(self.num_envs)
-        terminated, truncated = np.zeros((2, self.num_envs), bool)
-        restart = self._finished & (self.autoreset_mode is AutoresetMode.NEXT_STEP)
+        next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
+        # Without autoreset a finished environment stands still: same flags, reward 0.
+        terminated, truncated = self._ends & (not next_step)
+        restart = self._finished & next_step
         if restart.any():
             nothing = [{}] * self.num_envs
             self._start(np.flatnonzero(restart), [None] * self.num_envs, nothing)
-        active = np.flatnonzero(~restart)
+        active = np.flatnonzero(~self._finished & ~restart)
         if active.size:
             outcome = self._advance(active, actions)
             self._elapsed[active] += 1
             rewards[active], terminated[active], truncated[active] = outcome
             if self.episode_length is not None:
                 truncated[active] |= self._elapsed[active] >= self.episode_length
-        self._finished = terminated | truncated
+        self._ends = np.stack([terminated, truncated])
         return self._observe(), rewards, terminated, truncated, self._info()
+
+    @property
+    def _finished(self) -> np.ndarray:
+        return np.asarray(self._ends.any(0))
 
     @property
     def sim_params(self) -> dict[str, np.ndarray]:
@@ -124,7 +131,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             for name, value in values.items():
                 self._sim_params.setdefault(name, np.full(self.num_envs, np.nan))[i] = value
         self._elapsed[chosen] = 0
-        self._finished[chosen] = False
+        self._ends[:, chosen] = False
 
     def _read_seeds(self, seed: Seeds) -> list[int | None]:
         if seed is None or isinstance(seed, int | np.integer):
@@ -257,17 +264,28 @@ class SequentialVectorEnv(HeadwayVectorEnv):
                 self._rngs[i] = seeding.np_random(seed)[0]
             requested = self._sets.sample(self._rngs[i]) | requested
         options = {"sim_params": requested} if requested else None
-        self._obs[i], info = self.envs[i].reset(seed=seed, options=options)
+        obs, info = self.envs[i].reset(seed=seed, options=options)
+        self._obs[i] = self._check_obs(obs)
         return requested | info.get("sim_params", {})
 
     def _advance(self, active: np.ndarray, actions: np.ndarray) -> Outcome:
         rewards, terminated, truncated = [], [], []
         for i in active:
-            self._obs[i], reward, ends, cut, _ = self.envs[i].step(actions[i])
-            rewards.append(float(reward))
+            obs, reward, ends, cut, _ = self.envs[i].step(actions[i])
+            self._obs[i] = self._check_obs(obs)
+            rewards.append(_number(reward))
             terminated.append(bool(ends))
             truncated.append(bool(cut))
         return Outcome(np.array(rewards), np.array(terminated), np.array(truncated))
+
+    def _check_obs(self, obs: Any) -> np.ndarray:
+        allowed = self.single_observation_space.shape
+        if np.shape(obs) != allowed:
+            raise BadEnvironmentError(
+                f"an environment returned obs of shape {np.shape(obs)}, allowed: {allowed}, as"
+                " its observation_space says; correct the environment."
+            )
+        return np.asarray(obs)
 
     def _observe(self) -> np.ndarray:
         return np.stack(self._obs)
@@ -276,3 +294,13 @@ class SequentialVectorEnv(HeadwayVectorEnv):
         """Close the environments."""
         for env in self.envs:
             env.close()
+
+
+def _number(reward: Any) -> float:
+    try:
+        return float(reward)
+    except (TypeError, ValueError):
+        raise BadEnvironmentError(
+            f"an environment returned the reward {reward!r}, allowed: a number; correct the"
+            " environment."
+        ) from None

@@ -42,7 +42,7 @@ def evaluate_agent(
     *,
     key: PRNGKeyArray,
     on_step: Callable[[int], None] = lambda steps: None,
-) -> dict[str, list[Trajectory]]:
+) -> tuple[dict[str, list[Trajectory]], int]:
     """Run the test episodes of some groups, as many side by side as the batch holds.
 
     Args:
@@ -54,7 +54,8 @@ def evaluate_agent(
         on_step: Called after each step with the number of environments that stepped.
 
     Returns:
-        The trajectories of each group, in the order of their episodes.
+        The trajectories of each group, in the order of their episodes, and the number of
+        planner iterations that found nothing finite.
     """
     sim_params = config.sim_params or arena.spec.sim_params
     evaluation = config.evaluation
@@ -64,14 +65,15 @@ def evaluate_agent(
         for episode in group_episodes(sim_params, group, evaluation.num_episodes, evaluation.seed)
     ]
     found: dict[str, list[Trajectory]] = {group: [] for group in groups}
-    size = arena.vector.num_envs
+    size, failures = arena.vector.num_envs, 0
     for chunk, start in enumerate(range(0, len(episodes), size)):
         batch = episodes[start : start + size]
         policy = agent_policy(agent, size, key=jax.random.fold_in(key, chunk))
         rollout = run_episodes(arena, [episode for _, episode in batch], policy, on_step)
+        failures += rollout.planner_failures
         for (group, _), trajectory in zip(batch, rollout.trajectories, strict=True):
             found[group].append(trajectory)
-    return found
+    return found, failures
 
 
 def episode_rows(

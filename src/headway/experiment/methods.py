@@ -86,6 +86,7 @@ def _paper(spec: EnvSpec) -> Settings:
 def _released_code(spec: EnvSpec) -> Settings:
     options = {"observe_average_velocity": False}
     return {
+        "fitting.epochs": spec.epochs,
         "env_options": {name: options[name] for name in options if name in spec.options},
         "fitting.bootstrap": True,
         "fitting.drop_first_anchor": True,
@@ -175,10 +176,23 @@ def make_config(
     for kind, name, table in (("method", method, METHODS), ("preset", preset, PRESETS)):
         if name not in table:
             raise unknown_name(kind, name, table)
+    for name in ("env", "method", "preset", "seed"):
+        if name in (settings or {}):
+            raise ConfigError(f"{name} is no setting to override; pass it as {name}=... instead.")
     named = {**PRESETS[preset].settings(spec), **METHODS[method].settings}
     start = Config(env=spec.name, method=method, preset=preset)
     config = override(start, {**named, "seed": seed, **(settings or {})})
+    check_options(config)
+    return config
+
+
+def check_options(config: Config) -> None:
+    """Refuse switches that the environment does not have.
+
+    Raises:
+        ConfigError: An option is unknown.
+    """
+    spec = env_spec(config.env)
     for option in config.env_options:
         if option not in spec.options:
             raise ConfigError(str(unknown_name(f"{spec.name} option", option, spec.options)))
-    return config

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from headway import envs
 from headway.config import Config
@@ -73,7 +73,7 @@ class Policy(Protocol):
 
     def __call__(
         self, obs: Float[np.ndarray, "env obs"]
-    ) -> tuple[Float[np.ndarray, "env action"], int]:
+    ) -> tuple[Float[np.ndarray, "env action"], Int[np.ndarray, " env"]]:
         """Return actions in [-1, 1], and how many planner iterations found nothing finite."""
         ...
 
@@ -81,7 +81,8 @@ class Policy(Protocol):
 def random_policy(arena: Arena, rng: np.random.Generator) -> Policy:
     """Uniform random actions, as in the first iteration."""
     shape = (arena.vector.num_envs, arena.task.action_size)
-    return lambda obs: (rng.uniform(-1.0, 1.0, shape).astype(np.float32), 0)
+    no_failures = np.zeros(arena.vector.num_envs, int)
+    return lambda obs: (rng.uniform(-1.0, 1.0, shape).astype(np.float32), no_failures)
 
 
 def agent_policy(agent: Agent, num_envs: int, *, key: PRNGKeyArray) -> Policy:
@@ -91,8 +92,7 @@ def agent_policy(agent: Agent, num_envs: int, *, key: PRNGKeyArray) -> Policy:
     def act(obs):
         nonlocal state
         state, decision = agent.act(state, jnp.asarray(obs, jnp.float32))
-        action, failures = jax.device_get((decision.action, decision.failures))
-        return action, int(failures.sum())
+        return jax.device_get((decision.action, decision.failures))
 
     return act
 
@@ -135,7 +135,7 @@ def run_episodes(
     failures = 0
     for step in range(arena.episode_length):
         action, failed = policy(obs)
-        failures += failed
+        failures += int(failed[:wanted][running[:wanted]].sum())
         obs, reward, ends, cut, _ = arena.vector.step(scale(arena.task, action))
         observations.append(check(arena, obs, filled, "obs", step + 1))
         rewards.append(check(arena, reward, filled, "reward", step + 1))

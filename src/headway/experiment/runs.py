@@ -86,7 +86,12 @@ class RunDir:
         Raises:
             RunError: The directory holds something else, or a run with other settings.
         """
-        if not self.path.exists() or not any(self.path.iterdir()):
+        if self.path.exists() and not self.path.is_dir():
+            raise RunError(
+                f"{self.path} is a file, allowed: a directory; choose another --run-dir."
+            )
+        found = self.path.iterdir() if self.path.exists() else ()
+        if all(path.name.endswith(storage.UNFINISHED) for path in found):
             storage.write_json(self.path / "config.json", _config_file(config))
             return
         if not (self.path / "config.json").exists():
@@ -125,9 +130,33 @@ class RunDir:
         """Iterations that are complete."""
         return len(self.metrics())
 
+    def check(self) -> None:
+        """Read every table once, so that damage is found before work is done.
+
+        Raises:
+            RunError: A table is damaged, or the metrics of finished iterations are gone.
+        """
+        self.evaluation()
+        self.assignments()
+        self.prediction_errors()
+        beyond = self.checkpoint(self.finished_iterations + 1)
+        if beyond.exists():
+            raise RunError(
+                f"{self.path / 'metrics.jsonl'} holds {self.finished_iterations} iterations, but"
+                f" {beyond.name} exists; restore the metrics or delete the run."
+            )
+
     def metrics(self) -> list[dict[str, Any]]:
         """One entry per finished iteration."""
-        return storage.read_json_lines(self.path / "metrics.jsonl")
+        path = self.path / "metrics.jsonl"
+        rows = storage.read_json_lines(path)
+        for index, row in enumerate(rows):
+            if not isinstance(row, dict) or row.get("iteration") != index:
+                raise RunError(
+                    f"{path} is damaged in line {index + 1}, allowed: iteration {index}; restore it"
+                    " or delete the run."
+                )
+        return rows
 
     def evaluation(self) -> list[EpisodeRow]:
         """Every test episode of the finished iterations."""
@@ -136,7 +165,8 @@ class RunDir:
             rows = [EpisodeRow.from_csv(row) for row in storage.read_csv(path, EVALUATION_COLUMNS)]
         except ValueError as error:
             raise RunError(f"{path} is damaged ({error}); restore it or delete the run.") from None
-        return [row for row in rows if row.iteration < self.finished_iterations]
+        finished = self.finished_iterations
+        return [row for row in rows if row.iteration < finished]
 
     def assignments(self) -> list[dict[str, Any]]:
         """Share of segments that each head owns, per iteration, member and physics."""
@@ -196,12 +226,13 @@ class RunDir:
             ]
         except ValueError as error:
             raise RunError(f"{self.path / name} is damaged ({error}); delete it.") from None
-        return [row for row in typed if int(row["iteration"]) < self.finished_iterations]
+        finished = self.finished_iterations
+        return [row for row in typed if int(row["iteration"]) < finished]
 
 
 def format_sim_params(sim_params: Mapping[str, float]) -> str:
     """Write simulator parameters as one cell, for example `length=0.5 mass=1`."""
-    return " ".join(f"{name}={value:g}" for name, value in sorted(sim_params.items()))
+    return " ".join(f"{name}={value:.12g}" for name, value in sorted(sim_params.items()))
 
 
 def parse_sim_params(text: str) -> dict[str, float]:

@@ -19,11 +19,13 @@ from headway.errors import RunError
 
 Tree = TypeVar("Tree")
 
+UNFINISHED = ".writing"  # ends the name of a file that is not complete yet
+
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a whole file under a temporary name, then rename it into place."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.writing")
+    temporary = path.with_name(f".{path.name}{UNFINISHED}")
     with temporary.open("wb") as file:
         file.write(content)
         file.flush()

@@ -16,6 +16,7 @@ from headway.errors import DivergenceError, RunError
 from headway.experiment import storage
 from headway.experiment.diagnostics import head_shares, prediction_error
 from headway.experiment.evaluation import episode_rows, evaluate_agent
+from headway.experiment.methods import check_options
 from headway.experiment.progress import Progress
 from headway.experiment.rollouts import Arena, Episode, agent_policy, random_policy, run_episodes
 from headway.experiment.runs import RunDir
@@ -69,6 +70,7 @@ class Trainer:
         """
         arena = Arena.make(config)
         run.create_or_resume(config)
+        run.check()
         setup = FitSetup(arena.task, config.fitting, config.model.history_length)
         buffer = ReplayBuffer(arena.task.obs_size, arena.task.action_size)
         for trajectory in run.load_data():
@@ -115,7 +117,7 @@ class Trainer:
         clock.append(time.perf_counter())
         fitting = self.fit(iteration, keys.fit)
         clock.append(time.perf_counter())
-        tested = self.evaluate(iteration, keys.evaluate)
+        tested, test_failures = self.evaluate(iteration, keys.evaluate)
         clock.append(time.perf_counter())
         metrics = {
             "iteration": iteration,
@@ -123,6 +125,7 @@ class Trainer:
             "collection": {**_summary(collected), "planner_failures": failures},
             "fitting": fitting,
             "evaluation": {group: _summary(found) for group, found in tested.items()},
+            "test_planner_failures": test_failures,
             "seconds": {
                 name: round(clock[i + 1] - clock[i], 3)
                 for i, name in enumerate(("collect", "fit", "evaluate"))
@@ -201,11 +204,13 @@ class Trainer:
             "transitions": sum(lengths),
         }
 
-    def evaluate(self, iteration: int, key: PRNGKeyArray) -> dict[str, list[Trajectory]]:
+    def evaluate(
+        self, iteration: int, key: PRNGKeyArray
+    ) -> tuple[dict[str, list[Trajectory]], int]:
         """Test on the unseen groups, and on the training physics when the settings say so."""
         groups = self.groups(iteration)
         if not groups:
-            return {}
+            return {}, 0
         self.phase(iteration, "evaluate")
         advance = self.progress.advance
         return evaluate_agent(self.agent, self.arena, self.config, groups, key=key, on_step=advance)
@@ -312,6 +317,7 @@ def load_agent(run: RunDir) -> Agent:
 
 def load_task(config: Config) -> Task:
     """The Task of a configuration, with its environment's options."""
+    check_options(config)
     spec = env_spec(config.env)
     return spec.make_task(**{**spec.options, **config.env_options})
 
@@ -320,7 +326,8 @@ def write_tensorboard(path: Path, metrics: dict[str, Any]) -> None:
     """Add one iteration's numbers to the TensorBoard log, over environment steps."""
     from tensorboardX import SummaryWriter
 
-    with SummaryWriter(str(path / "tensorboard"), write_to_disk=True) as writer:
+    suffix = f".{metrics['iteration']:03d}"
+    with SummaryWriter(str(path / "tensorboard"), filename_suffix=suffix) as writer:
         for section in ("collection", "fitting", "evaluation", "seconds"):
             for name, value in metrics[section].items():
                 number = value["return_mean"] if isinstance(value, dict) else value

@@ -66,7 +66,7 @@ def oracle_loss(
     """
     num_heads = losses.shape[1]
     owned = (assignment[:, None] == jnp.arange(num_heads)[:, None]) * weight[:, None]
-    total = (losses * owned).sum(-1)
+    total = jnp.where(owned > 0, losses * owned, 0.0).sum(-1)
     if reduction == "head":
         return (total / jnp.maximum(owned.sum(-1), 1.0)).sum()
     return (total.sum(-1) / jnp.maximum(weight.sum(-1), 1.0)).sum()

@@ -28,8 +28,8 @@ class Normalizer(eqx.Module):
 
     @classmethod
     def of_moments(cls, mean: np.ndarray, std: np.ndarray) -> "Normalizer":
-        """Build from moments computed in float64; rounding noise counts as constant."""
-        constant = std <= 1e-7 * np.maximum(np.abs(mean), 1e-12)
+        """Build from moments computed in float64; what float32 can't resolve is constant."""
+        constant = std <= 1e-5 * np.maximum(np.abs(mean), 1e-12)
         return cls(
             jnp.asarray(mean, jnp.float32), jnp.asarray(np.where(constant, 0, std), jnp.float32)
         )

@@ -62,5 +62,9 @@ class Controller:
 
     @property
     def heads(self) -> Int[np.ndarray, " member"] | None:
-        """The prediction head that each member plans with now; None before the first action."""
+        """The prediction head that each member plans with now; None before the first action.
+
+        With `head_selection="average"`, which plans with all heads, the one that explains the
+        recent past best.
+        """
         return self._heads
