@@ -310,3 +310,56 @@ def test_physics_differ_between_neighbours(name):
     gaps = np.abs(obs[:, None] - obs[None]).max(-1)[np.triu_indices(number, 1)]
     assert gaps.min() > 1e-6
     vector.close()
+
+
+class Brittle(gymnasium.Env):
+    """Ends after `steps` steps and must not be stepped again."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, steps):
+        self.steps = steps
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count = 0
+        return np.zeros(1, np.float32), {"sim_params": {}}
+
+    def step(self, action):
+        assert self.count < self.steps, "stepped after the end"
+        self.count += 1
+        return np.full(1, self.count, np.float32), 1.0, self.count == self.steps, False, {}
+
+
+def test_finished_environments_stand_still_without_autoreset():
+    env = SequentialVectorEnv(
+        [lambda: Brittle(2), lambda: Brittle(4)], autoreset_mode=AutoresetMode.DISABLED
+    )
+    env.reset(seed=0)
+    rows = [env.step(np.zeros((2, 1), np.float32))[:4] for _ in range(4)]
+    assert [obs[:, 0].tolist() for obs, *_ in rows] == [[1, 1], [2, 2], [2, 3], [2, 4]]
+    assert [reward.tolist() for _, reward, *_ in rows] == [[1, 1], [1, 1], [0, 1], [0, 1]]
+    assert [ends.tolist() for *_, ends, _ in rows] == [
+        [False, False],
+        [True, False],
+        [True, False],
+        [True, True],
+    ]
+    env.reset(options={"reset_mask": np.array([True, False])})
+    assert env.step(np.zeros((2, 1), np.float32))[0][:, 0].tolist() == [1, 4]
+
+
+@pytest.mark.parametrize(
+    ("result", "says"),
+    [
+        ((np.zeros(2), 0.0, False, False, {}), r"obs of shape \(2,\), allowed: \(1,\)"),
+        ((np.zeros(1), None, False, False, {}), "reward None, allowed: a number"),
+    ],
+)
+def test_misshapen_results_are_named(result, says, monkeypatch):
+    monkeypatch.setattr(Brittle, "step", lambda self, action: result)
+    env = SequentialVectorEnv([lambda: Brittle(2)])
+    env.reset(seed=0)
+    with pytest.raises(BadEnvironmentError, match=says):
+        env.step(np.zeros((1, 1), np.float32))
