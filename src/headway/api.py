@@ -97,7 +97,7 @@ def evaluate(
     config = run.config()
     agent = load_agent(run)
     arena = Arena.make(config)
-    known = (config.sim_params or arena.spec.sim_params).group_names
+    known = arena.sim_params.group_names
     for group in groups or ():
         if group not in known:
             raise unknown_name("group", group, known)

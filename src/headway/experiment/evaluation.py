@@ -57,12 +57,13 @@ def evaluate_agent(
         The trajectories of each group, in the order of their episodes, and the number of
         planner iterations that found nothing finite.
     """
-    sim_params = config.sim_params or arena.spec.sim_params
     evaluation = config.evaluation
     episodes = [
         (group, episode)
         for group in groups
-        for episode in group_episodes(sim_params, group, evaluation.num_episodes, evaluation.seed)
+        for episode in group_episodes(
+            arena.sim_params, group, evaluation.num_episodes, evaluation.seed
+        )
     ]
     found: dict[str, list[Trajectory]] = {group: [] for group in groups}
     size, failures = arena.vector.num_envs, 0

@@ -137,7 +137,7 @@ def _smoke(spec: EnvSpec) -> Settings:
 
 
 _PRESETS = (
-    Preset("paper", "the supplement's numbers; hours on a GPU, days on a CPU", _paper),
+    Preset("paper", "the supplement's numbers; wants a GPU", _paper),
     Preset("quick", "a smaller network, planner and schedule; minutes on a laptop", _quick),
     Preset("smoke", "tiny sizes that only show that everything runs; seconds", _smoke),
     Preset(

@@ -18,6 +18,7 @@ from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import BadEnvironmentError
 from headway.planning.agent import Agent
+from headway.sim_params import SimParamSets
 from headway.tasks.base import Task
 from headway.tasks.catalog import EnvSpec, env_spec
 
@@ -37,6 +38,7 @@ class Arena:
     spec: EnvSpec
     task: Task
     vector: VectorEnv
+    sim_params: SimParamSets
     episode_length: int
 
     @classmethod
@@ -50,10 +52,11 @@ class Arena:
         options = {**spec.options, **config.env_options}
         task = spec.make_task(**options)
         length = config.collection.episode_length or spec.episode_length
+        sim_params = config.sim_params or spec.sim_params
         vector = envs.make_vec(
             config.env,
             config.collection.num_episodes,
-            sim_params=config.sim_params or spec.sim_params,
+            sim_params=sim_params,
             options=options,
             autoreset_mode=AutoresetMode.DISABLED,
             episode_length=length,
@@ -65,7 +68,7 @@ class Arena:
                 f"{config.env} has observation and action shapes {got}, allowed: {allowed}, as"
                 f" its Task says; correct the environment or the Task."
             )
-        return cls(spec, task, vector, length)
+        return cls(spec, task, vector, sim_params, length)
 
 
 class Policy(Protocol):

@@ -21,7 +21,7 @@ from headway.experiment.progress import Progress
 from headway.experiment.rollouts import Arena, Episode, agent_policy, random_policy, run_episodes
 from headway.experiment.runs import RunDir
 from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.models.fitting import EpochStats, FitSetup, FitState, fit_epoch, make_data
+from headway.models.fitting import EpochStats, FitData, FitSetup, FitState, fit_epoch, make_data
 from headway.planning.agent import Agent
 from headway.tasks.base import Task
 from headway.tasks.catalog import env_spec
@@ -105,7 +105,7 @@ class Trainer:
         last = iteration == self.config.collection.num_iterations - 1
         if not last and (iteration + 1) % evaluation.every:
             return []
-        train, *unseen = (self.config.sim_params or self.arena.spec.sim_params).group_names
+        train, *unseen = self.arena.sim_params.group_names
         with_train = last or evaluation.training_group == "always"
         return [train, *unseen] if with_train else unseen
 
@@ -138,10 +138,9 @@ class Trainer:
         """Run one episode in each environment, under physics drawn from the training set."""
         config, arena = self.config, self.arena
         rng = np.random.default_rng([config.seed, iteration])
-        sim_params = config.sim_params or arena.spec.sim_params
         num_episodes = config.collection.num_episodes
         seeds = rng.integers(2**31 - 1, size=num_episodes)
-        episodes = [Episode(sim_params.sample(rng), int(seed)) for seed in seeds]
+        episodes = [Episode(arena.sim_params.sample(rng), int(seed)) for seed in seeds]
         if iteration == 0:
             policy = random_policy(arena, rng)
         else:
@@ -164,28 +163,13 @@ class Trainer:
         Raises:
             DivergenceError: No update of an epoch had finite numbers.
         """
-        config, fitting = self.config, self.config.fitting
-        lengths = [len(trajectory) for trajectory in self.buffer.trajectories]
-        size = config.collection
-        capacity = size.num_iterations * size.num_episodes * self.arena.episode_length
-        samples = Samples.table(
-            lengths,
-            fitting.future_length,
-            capacity * fitting.future_length,
-            drop_first=fitting.drop_first_anchor,
-        )
-        statistics = Statistics.fit(
-            self.arena.task, self.buffer.trajectories, config.model.history_length
-        )
+        fitting = self.config.fitting
         data_key, epoch_key = jax.random.split(key)
-        members = config.model.num_members
-        data = make_data(
-            self.episodes(), samples, statistics, fitting, num_members=members, key=data_key
-        )
+        data = self.fit_data(data_key)
         independent = (
             iteration < fitting.warmup_iterations
             or fitting.oracle == "independent"
-            or config.model.num_heads == 1
+            or self.config.model.num_heads == 1
         )
         self.phase(iteration, "fit")
         state, history = self.learned.fit, []
@@ -195,14 +179,28 @@ class Trainer:
             history.append(jax.device_get(stats))
             check_epoch(history[-1], iteration, epoch)
             self.progress.advance(1, loss=float(history[-1].loss))
-        self.learned = Learned(state, statistics)
+        self.learned = Learned(state, data.statistics)
         return {
             "loss": float(history[-1].loss),
             "forward_loss": float(history[-1].forward_loss),
             "updates": sum(int(stats.updates) for stats in history),
             "skipped_updates": sum(int(stats.skipped) for stats in history),
-            "transitions": sum(lengths),
+            "transitions": self.buffer.num_transitions,
         }
+
+    def fit_data(self, key: PRNGKeyArray) -> FitData:
+        """Everything collected, with renewed statistics, ready to be fitted."""
+        config, fitting = self.config, self.config.fitting
+        trajectories, episodes = self.buffer.trajectories, self.episodes()
+        samples = Samples.table(
+            [len(trajectory) for trajectory in trajectories],
+            fitting.future_length,
+            capacity=episodes.action[..., 0].size * fitting.future_length,
+            drop_first=fitting.drop_first_anchor,
+        )
+        statistics = Statistics.fit(self.arena.task, trajectories, config.model.history_length)
+        members = config.model.num_members
+        return make_data(episodes, samples, statistics, fitting, num_members=members, key=key)
 
     def evaluate(
         self, iteration: int, key: PRNGKeyArray
