@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from headway.config import PlannerConfig
+from headway.models.compilation import jit_networks
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.planning.heads import RecentTransitions, head_errors, select_heads
 from headway.planning.optimizers import make_optimizer
@@ -71,7 +72,7 @@ class Agent(eqx.Module):
         return _act(self, state, jnp.asarray(obs, jnp.float32))
 
 
-@eqx.filter_jit
+@jit_networks
 def _act(
     agent: Agent, state: AgentState, obs: Float[Array, "env obs"]
 ) -> tuple[AgentState, Decision]:
