@@ -181,7 +181,7 @@ class PlannerConfig:
         problems.one_of("selection_error", ("mean", "sampled"))
         problems.one_of("reward", ("task", "released"))
         problems.require(
-            self.num_elites <= self.num_candidates or self.optimizer != "cem",
+            self.optimizer == "random-shooting" or self.num_elites <= self.num_candidates,
             f"num_elites is {self.num_elites}, allowed: at most num_candidates"
             f" ({self.num_candidates})",
         )

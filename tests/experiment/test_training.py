@@ -157,7 +157,7 @@ def test_reset_makes_a_controller_forget(reference):
 
 @pytest.mark.parametrize(
     ("obs", "says"),
-    [(np.zeros(4), r"\(4,\), allowed: \(3,\)"), ([0, np.nan, 0], r"obs\[1\] is nan")],
+    [(np.zeros(4), r"\(4,\), allowed: \(3,\)"), (np.array([0, np.nan, 0]), r"obs\[1\] is nan")],
 )
 def test_bad_observation_is_refused(obs, says, reference):
     with pytest.raises(headway.ConfigError, match=says):
