@@ -18,6 +18,7 @@ from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import BadEnvironmentError
 from headway.planning.agent import Agent
+from headway.planning.controller import env_action
 from headway.sim_params import SimParamSets
 from headway.tasks.base import Task
 from headway.tasks.catalog import EnvSpec, env_spec
@@ -139,7 +140,7 @@ def run_episodes(
     for step in range(arena.episode_length):
         action, failed = policy(obs)
         failures += int(failed[:wanted][running[:wanted]].sum())
-        obs, reward, ends, cut, _ = arena.vector.step(scale(arena.task, action))
+        obs, reward, ends, cut, _ = arena.vector.step(env_action(arena.task, action))
         observations.append(check(arena, obs, filled, "obs", step + 1))
         rewards.append(check(arena, reward, filled, "reward", step + 1))
         actions.append(action)
@@ -155,14 +156,6 @@ def run_episodes(
         for row in range(wanted)
     ]
     return Rollout(trajectories, failures)
-
-
-def scale(task: Task, action: Float[np.ndarray, "env action"]) -> Float[np.ndarray, "env action"]:
-    """`Task.scale_action` in NumPy, exactly within the environment's bounds."""
-    low, high = np.asarray(task.action_low), np.asarray(task.action_high)
-    return np.clip(low + 0.5 * (action.astype(np.float64) + 1.0) * (high - low), low, high).astype(
-        np.float32
-    )
 
 
 def check(

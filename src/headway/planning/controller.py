@@ -6,6 +6,7 @@ from jaxtyping import Float, Int
 
 from headway.errors import ConfigError
 from headway.planning.agent import Agent
+from headway.tasks.base import Task
 
 
 class Controller:
@@ -56,9 +57,7 @@ class Controller:
         self._state, decision = self.agent.act(self._state, obs[None].astype(np.float32))
         scaled, heads = jax.device_get((decision.action[0], decision.heads[0]))
         self._heads = heads
-        low, high = np.asarray(task.action_low), np.asarray(task.action_high)
-        action = low + 0.5 * (scaled + 1.0) * (high - low)
-        return np.clip(action, low, high).astype(np.float32)
+        return env_action(task, scaled)
 
     @property
     def heads(self) -> Int[np.ndarray, " member"] | None:
@@ -68,3 +67,12 @@ class Controller:
         recent past best.
         """
         return self._heads
+
+
+def env_action(
+    task: Task, action: Float[np.ndarray, "*batch action"]
+) -> Float[np.ndarray, "*batch action"]:
+    """`Task.scale_action` in NumPy, exactly within the environment's bounds."""
+    low, high = np.asarray(task.action_low), np.asarray(task.action_high)
+    scaled = low + 0.5 * (action.astype(np.float64) + 1.0) * (high - low)
+    return np.clip(scaled, low, high).astype(np.float32)
