@@ -156,6 +156,11 @@ class PlannerConfig:
     """Standard deviation of CEM's first candidates, actions being scaled to [-1, 1]."""
     num_particles: int = 20
     """Imagined rollouts per candidate; a multiple of `model.num_members`."""
+    particle_noise: Literal["independent", "shared"] = "independent"
+    """Whether every candidate draws its own noise, or all share that of their particles: faster,
+    and candidates are compared under equal luck."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """What the networks multiply while planning; sums and states are always float32."""
     head_selection: HeadSelection = "adaptive"
     """Which head plans: the best on recent transitions, their average, or a random one."""
     selection_length: int = 10
@@ -180,6 +185,8 @@ class PlannerConfig:
         problems.one_of("head_selection", typing.get_args(HeadSelection))
         problems.one_of("selection_error", ("mean", "sampled"))
         problems.one_of("reward", ("task", "released"))
+        problems.one_of("particle_noise", ("independent", "shared"))
+        problems.one_of("precision", ("float32", "bfloat16"))
         problems.require(
             self.optimizer == "random-shooting" or self.num_elites <= self.num_candidates,
             f"num_elites is {self.num_elites}, allowed: at most num_candidates"

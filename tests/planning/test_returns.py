@@ -11,7 +11,9 @@ import pytest
 import toys
 from headway.models.dynamics import GaussianNet, MultiHeadDynamics, network_input
 from headway.models.networks import DenseHeads
-from headway.planning.returns import ImaginedDynamics, candidate_returns
+from headway.planning import returns
+from headway.planning.imagination import ImaginedDynamics
+from headway.planning.returns import RolloutSettings, candidate_returns
 
 KEY = jax.random.key(0)
 
@@ -32,14 +34,16 @@ class CornerTask(toys.PointTask):
         return next_obs[..., 0] > 1.0
 
 
-def fold(model, heads, statistics=None, context=None):
+def fold(model, heads, statistics=None, context=None, **options):
     statistics = statistics or toys.identity_statistics()
-    return ImaginedDynamics.fold(model, statistics, jnp.asarray(heads), context)
+    return ImaginedDynamics.fold(model, statistics, jnp.asarray(heads), context, **options)
 
 
-def returns_of(dynamics, obs, candidates, task=toys.POINT, **settings):
-    settings = {"particles_per_member": 2, "key": KEY} | settings
-    return candidate_returns(dynamics, task, jnp.asarray(obs), jnp.asarray(candidates), **settings)
+def returns_of(dynamics, obs, candidates, task=toys.POINT, *, key=KEY, **settings):
+    settings = RolloutSettings(**{"particles_per_member": 2} | settings)
+    return candidate_returns(
+        dynamics, task, jnp.asarray(obs), jnp.asarray(candidates), settings=settings, key=key
+    )
 
 
 def twin_returns(gains, heads, obs, candidates, reward, *, low, high, end=np.inf):
@@ -149,6 +153,41 @@ def test_noise_is_drawn_afresh_at_every_step_and_averages_out_over_heads(num_hea
     assert got[0, 0] != got[0, 1]
 
 
+def test_shared_noise_gives_equal_candidates_equal_returns_and_keeps_the_distribution():
+    std, horizon = 0.2, 6
+    candidates = np.zeros((1, 2, horizon, 2), np.float32)
+    dynamics = random_walk_dynamics(std)
+    settings = {"particles_per_member": 8000, "shared_noise": True}
+    got = returns_of(dynamics, np.zeros((1, 2)), candidates, **settings)
+    assert got[0, 0] == got[0, 1]
+    spread = -2 * std**2 * sum(range(1, horizon + 1))
+    np.testing.assert_allclose(got, [[spread, spread]], rtol=0.08)
+
+
+@pytest.mark.parametrize("at_once", [1, 2, 3, 5])
+def test_environments_in_chunks_have_the_same_returns_as_side_by_side(at_once, monkeypatch):
+    rng = np.random.default_rng(3)
+    model = toys.small_model()
+    obs = rng.normal(size=(5, 2)).astype(np.float32)
+    candidates = rng.uniform(-1, 1, (5, 6, 4, 2)).astype(np.float32)
+    heads = rng.integers(0, 2, (5, 2, 1))
+    context = jnp.asarray(rng.normal(size=(2, 5, 3)), jnp.float32)
+    dynamics = fold(model, heads, context=context)
+    whole = returns_of(dynamics, obs, candidates)
+    monkeypatch.setattr(returns, "environments_at_once", lambda *_: at_once)
+    np.testing.assert_allclose(returns_of(dynamics, obs, candidates), whole, rtol=1e-5)
+
+
+def test_an_environments_returns_do_not_depend_on_its_neighbours():
+    dynamics = fold(toys.small_model(), np.zeros((3, 2, 1), int), context=jnp.ones((2, 3, 3)))
+    alone = fold(toys.small_model(), np.zeros((1, 2, 1), int), context=jnp.ones((2, 1, 3)))
+    candidates = np.random.default_rng(4).uniform(-1, 1, (3, 4, 5, 2)).astype(np.float32)
+    together = returns_of(dynamics, np.ones((3, 2)), candidates)
+    single = returns_of(alone, np.ones((1, 2)), candidates[:1])
+    np.testing.assert_allclose(together[:1], single, rtol=1e-5)
+    assert not np.allclose(together[0], together[1])
+
+
 def test_noise_depends_on_the_key_only():
     candidates = np.zeros((1, 1, 3, 2), np.float32)
     dynamics = random_walk_dynamics(0.2)
@@ -171,12 +210,17 @@ def test_folded_model_equals_the_unfolded_one(which, with_context):
     rng = np.random.default_rng(0)
     obs, action, noise = (
         jnp.asarray(rng.normal(size=(2, 3, 4, 2)), jnp.float32) for _ in range(3)
-    )  # [member, env, row, feature]
+    )  # [member, env, particle, feature]
     context = jnp.asarray(rng.normal(size=(2, 3, 3)), jnp.float32) if with_context else None
     heads = np.asarray(HEADS[which])
     dynamics = fold(model, heads, statistics, context)
     x = jnp.concatenate([task.preprocess(obs), action], axis=-1)
-    mean, sample = dynamics.sample_delta(x, None), dynamics.sample_delta(x, noise)
+    mean, sample = np.empty((2, 2, 3, 4, 2))
+    for env in range(3):
+        one = dynamics.with_heads(jax.tree.map(lambda leaf, env=env: leaf[env], dynamics.heads))
+        wide = x[:, env].mT[..., None], noise[:, env].mT[..., None]  # one candidate
+        mean[:, env] = one.sample_delta(wide[0], None)[..., 0].mT
+        sample[:, env] = one.sample_delta(*wide)[..., 0].mT
     for env in range(3):
         inputs = network_input(task, statistics, obs[:, env], action[:, env])
         wide = None if context is None else jnp.repeat(context[:, env][:, None], 4, axis=1)

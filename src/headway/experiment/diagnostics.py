@@ -14,7 +14,8 @@ from headway.experiment.runs import format_sim_params
 from headway.models.fitting import FitSetup, assign_segments
 from headway.planning.agent import Agent, choose_heads, encode, planning_heads
 from headway.planning.heads import RecentTransitions
-from headway.planning.returns import ImaginedDynamics
+from headway.planning.imagination import ImaginedDynamics
+from headway.planning.returns import imagine_step
 
 NUM_STARTS = 256  # imagined rollouts per group in `prediction_error`
 
@@ -90,13 +91,16 @@ def _imagine(
     dynamics = ImaginedDynamics.fold(agent.model, agent.statistics, folded, context)
     members = agent.model.num_members
 
-    def step(obs, action):
-        action = jnp.broadcast_to(action[None, :, None], (*obs.shape[:-1], action.shape[-1]))
-        x = jnp.concatenate([agent.task.preprocess(obs), action], axis=-1)
-        obs = agent.task.postprocess(obs, dynamics.sample_delta(x, None))
-        return obs, obs[:, :, 0]
+    def imagine_one(heads, now, actions) -> Float[Array, "horizon member obs"]:
+        one = dynamics.with_heads(heads)
+
+        def step(obs, action):
+            wide = jnp.broadcast_to(action[:, None, None], (members, action.size, 1, 1))
+            obs = imagine_step(one, agent.task, obs, wide, None)
+            return obs, obs[..., 0, 0]
+
+        start = jnp.broadcast_to(now[:, None, None], (members, now.size, 1, 1))
+        return jax.lax.scan(step, start, actions)[1]
 
     now = recent.next_obs[:, -1]
-    start = jnp.broadcast_to(now[None, :, None], (members, len(now), 1, now.shape[-1]))
-    _, imagined = jax.lax.scan(step, start, actions.transpose(1, 0, 2))
-    return imagined.transpose(1, 2, 0, 3)
+    return jax.vmap(imagine_one)(dynamics.heads, now, actions).transpose(2, 0, 1, 3)

@@ -7,22 +7,34 @@ from typing import Any
 import equinox as eqx
 import jax
 
-# On a CPU, XLA's YNNPACK fusions slow the ensemble's products down: on two cores a plan of the
-# quick preset takes 1.5 times as long with them, a gradient step two to three times.
-_WANTED = {"xla_cpu_experimental_ynn_fusion_type": ""}
+# Found by measuring on CPUs (docs/performance.md): full-width vectors make the activations
+# faster, and YNNPACK's fusions slow float32 products down but are the only way to fast
+# bfloat16 ones.
+_WIDE_VECTORS = {"xla_cpu_prefer_vector_width": 512}
+_NO_FUSIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
+_WANTED = {"float32": (_WIDE_VECTORS, _NO_FUSIONS), "bfloat16": (_WIDE_VECTORS,)}
 
 
 @functools.cache
-def compiler_options() -> dict[str, Any]:
-    """The wanted compiler options, or none where this XLA does not know them."""
-    try:
-        jax.jit(lambda x: x + 1, compiler_options=_WANTED)(0.0)
-    except (jax.errors.JaxRuntimeError, ValueError):
-        return {}
-    return dict(_WANTED)
+def compiler_options(precision: str = "float32") -> dict[str, Any]:
+    """The compiler options for products of a precision, without those this XLA does not know.
+
+    Args:
+        precision: `float32` or `bfloat16`.
+    """
+    options: dict[str, Any] = {}
+    if jax.default_backend() != "cpu":
+        return options
+    for wanted in _WANTED[precision]:
+        try:
+            jax.jit(lambda x: x + 1, compiler_options=wanted)(0.0)
+        except (jax.errors.JaxRuntimeError, ValueError):
+            continue
+        options.update(wanted)
+    return options
 
 
-def jit_networks(function: Callable) -> Callable:
+def jit_networks(function: Callable, *, precision: str = "float32") -> Callable:
     """`equinox.filter_jit` with the compiler options for many small products.
 
     The function is wrapped when first called, so that importing stays light.
@@ -30,7 +42,7 @@ def jit_networks(function: Callable) -> Callable:
 
     @functools.cache
     def compiled() -> Callable:
-        options: dict[str, Any] = {"compiler_options": compiler_options()}
+        options: dict[str, Any] = {"compiler_options": compiler_options(precision)}
         return eqx.filter_jit(function, **options)
 
     @functools.wraps(function)

@@ -103,8 +103,12 @@ def truncated_normal(key: PRNGKeyArray, shape: tuple[int, ...], fan_in: int) -> 
 
 
 def swish(x: Float[Array, "..."]) -> Float[Array, "..."]:
-    """`x * sigmoid(x)`, the backbone's activation (supplement A.3)."""
-    return jax.nn.silu(x)
+    """`x * sigmoid(x)`, the backbone's activation (supplement A.3).
+
+    Through tanh, which XLA computes faster than the exponential and the division.
+    """
+    half = 0.5 * x
+    return half + half * jnp.tanh(half)
 
 
 def bound_logvar(

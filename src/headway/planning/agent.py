@@ -13,7 +13,8 @@ from headway.models.compilation import jit_networks
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.planning.heads import RecentTransitions, head_errors, select_heads
 from headway.planning.optimizers import make_optimizer
-from headway.planning.returns import ImaginedDynamics, candidate_returns
+from headway.planning.imagination import ImaginedDynamics
+from headway.planning.returns import RolloutSettings, candidate_returns
 from headway.tasks.base import Task
 
 
@@ -69,10 +70,10 @@ class Agent(eqx.Module):
         self, state: AgentState, obs: Float[Array | np.ndarray, "env obs"]
     ) -> tuple[AgentState, Decision]:
         """Choose the next action of every environment (paper, section 3.3; fact sheet C)."""
-        return _act(self, state, jnp.asarray(obs, jnp.float32))
+        act = _act_bfloat16 if self.planner.precision == "bfloat16" else _act_float32
+        return act(self, state, jnp.asarray(obs, jnp.float32))
 
 
-@jit_networks
 def _act(
     agent: Agent, state: AgentState, obs: Float[Array, "env obs"]
 ) -> tuple[AgentState, Decision]:
@@ -85,19 +86,16 @@ def _act(
     heads = choose_heads(agent, recent, context, error_key=error_key, head_key=head_key)
     # 4. Imagine candidates with it, and search for the best action sequence.
     dynamics = ImaginedDynamics.fold(
-        agent.model, agent.statistics, planning_heads(agent, heads), context
+        agent.model,
+        agent.statistics,
+        planning_heads(agent, heads),
+        context,
+        precision=agent.planner.precision,
     )
+    settings = RolloutSettings.of(agent.planner, agent.model.num_members)
 
     def score(candidates, key):
-        return candidate_returns(
-            dynamics,
-            agent.task,
-            obs,
-            candidates,
-            particles_per_member=agent.planner.num_particles // agent.model.num_members,
-            released_reward=agent.planner.reward == "released",
-            key=key,
-        )
+        return candidate_returns(dynamics, agent.task, obs, candidates, settings=settings, key=key)
 
     plan = make_optimizer(agent.planner).optimize(score, state.guess, key=plan_key)
     # 5. Take the first action; the rest, shifted by one step, is the next guess.
@@ -106,6 +104,10 @@ def _act(
     acted = jnp.ones_like(state.acted)
     state = AgentState(recent, obs, action, acted, guess, key)
     return state, Decision(action, heads, plan.failures)
+
+
+_act_float32 = jit_networks(_act)
+_act_bfloat16 = jit_networks(_act, precision="bfloat16")
 
 
 def encode(agent: Agent, recent: RecentTransitions) -> Float[Array, "member env context"] | None:

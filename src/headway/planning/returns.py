@@ -1,98 +1,37 @@
-"""Imagined rollouts: candidate action sequences in, returns out (fact sheet C.2).
+"""Imagined rollouts: candidate action sequences in, returns out (fact sheet C.2)."""
 
-Inside a plan the layout is [member, env, row, feature], a row being one particle of one
-candidate: members lead because their weights differ, and everything else becomes one
-matrix product per member.
-"""
+import dataclasses
+import functools
+from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.models.networks import Dense, bound_logvar, swish
+from headway.config import PlannerConfig
+from headway.planning.devices import environments_at_once, spread_candidates
+from headway.planning.imagination import ChosenHeads, ImaginedDynamics
 from headway.tasks.base import Task
 
 
-class ImaginedDynamics(eqx.Module):
-    """A dynamics model with all that is fixed during one plan folded into its weights.
+@dataclasses.dataclass(frozen=True)
+class RolloutSettings:
+    """What fixes a compiled rollout, apart from the shapes."""
 
-    Only the chosen heads remain, one set per environment and member; the context has become
-    part of their biases; normalisation has gone into the first layer and de-normalisation
-    into the heads. With several chosen heads the sampled delta is the average of their
-    samples (non-adaptive planning), drawn in one go.
-    """
-
-    hidden: tuple[Dense, ...]
-    mean_weight: Float[Array, "member env hidden obs"]
-    mean_bias: Float[Array, "member env obs"]
-    logvar_weight: Float[Array, "member env choice hidden obs"] | None
-    logvar_bias: Float[Array, "member env choice obs"] | None
-    min_logvar: Float[Array, "member env choice obs"] | None
-    max_logvar: Float[Array, "member env choice obs"] | None
-    delta_std: Float[Array, " obs"]
+    particles_per_member: int
+    shared_noise: bool = False
+    """Whether all candidates of a step share the noise of their particles."""
+    released_reward: bool = False
+    """Whether to plan with the released code's reward."""
 
     @classmethod
-    def fold(
-        cls,
-        model: MultiHeadDynamics,
-        statistics: Statistics,
-        heads: Int[Array, "env member choice"],
-        context: Float[Array, "member env context"] | None,
-    ) -> "ImaginedDynamics":
-        """Fold a model for one plan.
-
-        Args:
-            model: The dynamics model.
-            statistics: The normalisers in use.
-            heads: The chosen heads; one per environment and member, or all of them.
-            context: The context vector of each member and environment.
-        """
-        net = model.forward_net
-        choice = heads.transpose(1, 0, 2)
-        hidden_size = net.hidden[-1].bias.shape[-1]
-
-        def chosen(layer):
-            weight, bias = _take_heads(layer.weight, choice), _take_heads(layer.bias, choice)
-            if context is not None:
-                bias = bias + jnp.einsum("mec,mekco->meko", context, weight[..., hidden_size:, :])
-            return weight[..., :hidden_size, :], bias
-
-        delta = statistics.delta
-        mean_weight, mean_bias = chosen(net.mean_heads)
-        logvar_weight = logvar_bias = low = high = None
-        if net.logvar_heads is not None:
-            logvar_weight, logvar_bias = chosen(net.logvar_heads)
-            low, high = net.min_logvar[choice], net.max_logvar[choice]
+    def of(cls, planner: PlannerConfig, num_members: int) -> "RolloutSettings":
+        """Read them from the planner's settings."""
         return cls(
-            (_fold_input(net.hidden[0], statistics), *net.hidden[1:]),
-            mean_weight.mean(2) * delta.std,
-            mean_bias.mean(2) * delta.std + delta.mean,
-            logvar_weight,
-            logvar_bias,
-            low,
-            high,
-            delta.std,
+            planner.num_particles // num_members,
+            planner.particle_noise == "shared",
+            planner.reward == "released",
         )
-
-    def sample_delta(
-        self, x: Float[Array, "member env row in"], noise: Float[Array, "member env row obs"] | None
-    ) -> Float[Array, "member env row obs"]:
-        """Draw the next delta in raw units; its mean where `noise` is None."""
-        members, num_envs, rows, _ = x.shape
-        x = x.reshape(members, num_envs * rows, -1)
-        for layer in self.hidden:
-            x = swish(layer(x))
-        x = x.reshape(members, num_envs, rows, -1)
-        mean = x @ self.mean_weight + self.mean_bias[:, :, None]
-        if noise is None or self.logvar_weight is None:
-            return mean
-        logvar = x[:, :, None] @ self.logvar_weight + self.logvar_bias[..., None, :]
-        low, high = self.min_logvar[..., None, :], self.max_logvar[..., None, :]
-        var = jnp.exp(bound_logvar(logvar, low, high))
-        std = jnp.sqrt(var.sum(2)) / var.shape[2]
-        return mean + noise * std * self.delta_std
 
 
 def candidate_returns(
@@ -101,61 +40,107 @@ def candidate_returns(
     obs: Float[Array, "env obs"],
     candidates: Float[Array, "env candidate horizon action"],
     *,
-    particles_per_member: int,
-    released_reward: bool = False,
+    settings: RolloutSettings,
     key: PRNGKeyArray,
 ) -> Float[Array, "env candidate"]:
     """Mean return of each candidate over its particles, each staying with one member (TS∞).
 
     Every imagined step draws a fresh sample of the delta. A particle whose episode has
     terminated earns nothing more. Nothing is clipped: a rollout that leaves the finite
-    numbers gives a non-finite return, which ranks last.
+    numbers gives a non-finite return, which ranks last. An environment's result does not
+    depend on the others: each has its own random stream.
 
     Args:
         dynamics: The model, folded for this plan.
         task: Reward, termination, preprocessing.
         obs: Where each environment is now.
         candidates: Action sequences in [-1, 1].
-        particles_per_member: Imagined rollouts per candidate and member.
-        released_reward: Plan with the released code's reward.
+        settings: What else fixes the rollouts.
         key: Draws the noise of the rollouts.
     """
-    members = dynamics.mean_bias.shape[0]
-    num_envs, num_candidates, horizon, _ = candidates.shape
-    rows = num_candidates * particles_per_member
-    reward_of = task.released_reward if released_reward else task.reward
-    stochastic = dynamics.logvar_weight is not None
+    num_envs, num_candidates = candidates.shape[:2]
+    keys = jax.vmap(functools.partial(jax.random.fold_in, key))(jnp.arange(num_envs))
+
+    def of_one(heads, obs, candidates, key):
+        one = dynamics.with_heads(heads)
+        return _environment_returns(one, task, obs, candidates, settings=settings, key=key)
+
+    widest = max(layer.bias.shape[-1] for layer in dynamics.hidden)
+    rows = num_candidates * settings.particles_per_member * dynamics.num_members
+    at_once = environments_at_once(num_envs, 4 * widest * rows)
+    args: tuple[ChosenHeads, Array, Array, PRNGKeyArray] = (dynamics.heads, obs, candidates, keys)
+    if at_once == num_envs:
+        return jax.vmap(of_one)(*args)
+    batch_size = at_once if at_once > 1 else None
+    return jax.lax.map(lambda one: of_one(*one), args, batch_size=batch_size)
+
+
+def _environment_returns(
+    dynamics: ImaginedDynamics,
+    task: Task,
+    obs: Float[Array, " obs"],
+    candidates: Float[Array, "candidate horizon action"],
+    *,
+    settings: RolloutSettings,
+    key: PRNGKeyArray,
+) -> Float[Array, " candidate"]:
+    """`candidate_returns` of one environment; layout as in `imagination`."""
+    num_candidates, horizon, action_size = candidates.shape
+    members, particles = dynamics.num_members, settings.particles_per_member
+    rows = members, particles, num_candidates
+    reward_of = task.released_reward if settings.released_reward else task.reward
+    reward_of, terminated = over_rows(reward_of), over_rows(task.terminated)
+    scale_action = over_rows(task.scale_action)
 
     def imagine(carry, step):
         obs, alive, total = carry
-        scaled, key = step
-        scaled = jnp.repeat(scaled, particles_per_member, axis=1)
-        scaled = jnp.broadcast_to(scaled, (members, *scaled.shape))
-        x = jnp.concatenate([task.preprocess(obs), scaled], axis=-1)
-        noise = jax.random.normal(key, obs.shape) if stochastic else None
-        next_obs = task.postprocess(obs, dynamics.sample_delta(x, noise))
-        action = task.scale_action(scaled)
+        scaled, noise = step
+        scaled = spread_candidates(
+            jnp.broadcast_to(scaled[:, None], (members, action_size, *rows[1:]))
+        )
+        next_obs = imagine_step(dynamics, task, obs, scaled, draw(noise, obs.shape))
+        action = scale_action(scaled)
         total = total + jnp.where(alive, reward_of(obs, action, next_obs), 0.0)
-        alive = alive & ~task.terminated(obs, action, next_obs)
+        alive = alive & ~terminated(obs, action, next_obs)
         return (next_obs, alive, total), None
 
-    start = jnp.broadcast_to(obs[None, :, None], (members, num_envs, rows, obs.shape[-1]))
-    carry = start, jnp.ones(start.shape[:-1], bool), jnp.zeros(start.shape[:-1])
-    steps = candidates.transpose(2, 0, 1, 3), jax.random.split(key, horizon)
-    (_, _, total), _ = jax.lax.scan(imagine, carry, steps)
-    particles = total.reshape(members, num_envs, num_candidates, particles_per_member)
-    return particles.mean((0, 3))
+    def draw(noise, shape):
+        if not dynamics.stochastic:
+            return None
+        if settings.shared_noise:
+            return noise[..., None]
+        return spread_candidates(jax.random.normal(noise, shape))
+
+    if settings.shared_noise and dynamics.stochastic:
+        noise = jax.random.normal(key, (horizon, members, obs.shape[0], particles))
+    else:
+        noise = jax.random.split(key, horizon)
+    start = jnp.broadcast_to(obs[:, None, None], (members, obs.shape[0], *rows[1:]))
+    carry = spread_candidates(start), jnp.ones(rows, bool), jnp.zeros(rows)
+    (_, _, total), _ = jax.lax.scan(imagine, carry, (candidates.transpose(1, 2, 0), noise))
+    return total.mean((0, 1))
 
 
-def _take_heads(
-    values: Float[Array, "member head *rest"], choice: Int[Array, "member env choice"]
-) -> Float[Array, "member env choice *rest"]:
-    return values[jnp.arange(values.shape[0])[:, None, None], choice]
+def imagine_step(
+    dynamics: ImaginedDynamics,
+    task: Task,
+    obs: Float[Array, "member obs particle candidate"],
+    action: Float[Array, "member action particle candidate"],
+    noise: Float[Array, "member obs particle #candidate"] | None,
+) -> Float[Array, "member obs particle candidate"]:
+    """One imagined step of one environment.
+
+    Args:
+        dynamics: The model, folded, with one environment's heads.
+        task: How observations enter and leave the model.
+        obs: Where each rollout is.
+        action: What it does, in [-1, 1].
+        noise: Standard normal draws; None predicts the mean.
+    """
+    x = jnp.concatenate([over_rows(task.preprocess)(obs), action], axis=1)
+    return over_rows(task.postprocess)(obs, dynamics.sample_delta(x, noise))
 
 
-def _fold_input(layer: Dense, statistics: Statistics) -> Dense:
-    """Let the first layer take raw features and actions."""
-    scale = jnp.concatenate([statistics.features.scale, statistics.action.scale])
-    mean = jnp.concatenate([statistics.features.mean, statistics.action.mean])
-    weight = layer.weight / scale[:, None]
-    return Dense(weight, layer.bias - jnp.einsum("i,mio->mo", mean, weight))
+def over_rows(function: Callable) -> Callable:
+    """Let a Task's method, which wants features last, take [member, feature, *rows]."""
+    return jax.vmap(jax.vmap(function, in_axes=-1, out_axes=-1), in_axes=-1, out_axes=-1)

@@ -1,0 +1,53 @@
+"""Where a plan runs: how many environments at once, and on which devices.
+
+Decided when a plan is compiled. None of it changes a result beyond rounding.
+"""
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array
+
+CPU_BUDGET = 4 * 2**20
+"""Bytes that one array of activations may take on a CPU: more would leave its caches."""
+ARRAYS = 8
+"""How many such arrays a plan holds at most; the share of free GPU memory that one may take."""
+
+
+def environments_at_once(num_envs: int, bytes_per_env: int) -> int:
+    """How many environments are imagined side by side, so that memory stays bounded.
+
+    Args:
+        num_envs: Environments in all.
+        bytes_per_env: Size of one environment's widest array of activations.
+
+    Returns:
+        At least 1; the environments are spread evenly over the fewest chunks that fit.
+    """
+    fitting = max(1, activation_budget() // bytes_per_env)
+    chunks = -(-num_envs // fitting)
+    return -(-num_envs // chunks)
+
+
+def activation_budget() -> int:
+    """Bytes that one array of activations may take, on all devices together."""
+    budgets = [_device_budget(device) for device in jax.local_devices()]
+    return sum(budgets)
+
+
+def spread_candidates(x: Array) -> Array:
+    """Share the last axis, the candidates, among all local devices, where it can be divided."""
+    devices = jax.local_devices()
+    if len(devices) == 1 or x.shape[-1] % len(devices):
+        return x
+    mesh = Mesh(np.array(devices), ("candidate",))
+    spec = PartitionSpec(*[PartitionSpec.UNCONSTRAINED] * (x.ndim - 1), "candidate")
+    return jax.lax.with_sharding_constraint(x, NamedSharding(mesh, spec))
+
+
+def _device_budget(device: jax.Device) -> int:
+    stats = device.memory_stats() if device.platform != "cpu" else None
+    if not stats or "bytes_limit" not in stats:
+        return CPU_BUDGET
+    free = stats["bytes_limit"] - stats.get("bytes_in_use", 0)
+    return max(free, 0) // ARRAYS

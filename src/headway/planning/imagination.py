@@ -1,0 +1,183 @@
+"""The dynamics model as one plan needs it: folded, and laid out for fast products.
+
+Inside a plan the layout is [member, feature, particle, candidate]. Members lead because their
+weights differ; candidates come last, so that every elementwise operation, slice and sum over
+features runs over long contiguous rows, and what all candidates share is a plain broadcast.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from headway.models.dynamics import MultiHeadDynamics, Statistics
+from headway.models.networks import Dense, DenseHeads, bound_logvar, swish
+
+PRECISIONS = {"float32": jnp.float32, "bfloat16": jnp.bfloat16}
+
+
+class Layer(NamedTuple):
+    """One linear layer of every member; its products run in the weight's precision."""
+
+    weight: Float[Array, "*env member out in"]
+    bias: Float[Array, "*env member out"]
+
+    def __call__(
+        self, x: Float[Array, "member in particle candidate"]
+    ) -> Float[Array, "member out particle candidate"]:
+        """Apply each member's layer; sums are always float32."""
+        product = jnp.einsum(
+            "moi,mipc->mopc",
+            self.weight,
+            x.astype(self.weight.dtype),
+            preferred_element_type=jnp.float32,
+        )
+        return product + self.bias[:, :, None, None]
+
+
+class ChosenHeads(NamedTuple):
+    """The heads that one plan uses; means and log-variances come out of one product.
+
+    The layer's outputs are the mean delta in raw units (averaged over the choices), then each
+    choice's log-variance.
+    """
+
+    layer: Layer
+    min_logvar: Float[Array, "*env member choice obs"] | None
+    max_logvar: Float[Array, "*env member choice obs"] | None
+
+
+class ImaginedDynamics(eqx.Module):
+    """A dynamics model with all that is fixed during one plan folded into its weights.
+
+    Only the chosen heads remain, one set per environment and member; the context has become
+    part of their biases; normalisation has gone into the first layer and de-normalisation
+    into the heads. With several chosen heads the sampled delta is the average of their
+    samples (non-adaptive planning), drawn in one go.
+    """
+
+    hidden: tuple[Layer, ...]
+    heads: ChosenHeads
+    """With a leading environment axis after `fold`, without one after `with_heads`."""
+    delta_std: Float[Array, " obs"]
+
+    @classmethod
+    def fold(
+        cls,
+        model: MultiHeadDynamics,
+        statistics: Statistics,
+        heads: Int[Array, "env member choice"],
+        context: Float[Array, "member env context"] | None,
+        *,
+        precision: str = "float32",
+    ) -> "ImaginedDynamics":
+        """Fold a model for one plan.
+
+        Args:
+            model: The dynamics model.
+            statistics: The normalisers in use.
+            heads: The chosen heads; one per environment and member, or all of them.
+            context: The context vector of each member and environment.
+            precision: Of the products' inputs, `float32` or `bfloat16`. The first layer stays
+                in float32: it takes raw observations, whose offsets bfloat16 would not resolve.
+        """
+        net = model.forward_net
+        dtype = PRECISIONS[precision]
+        first, *others = net.hidden
+        hidden = (
+            _layer(_fold_input(first, statistics), jnp.float32),
+            *(_layer(layer, dtype) for layer in others),
+        )
+        delta = statistics.delta
+        mean_weight, mean_bias = _chosen(net.mean_heads, heads, context)
+        weights = [mean_weight.mean(2) * delta.std]
+        biases = [mean_bias.mean(2) * delta.std + delta.mean]
+        low = high = None
+        if net.logvar_heads is not None:
+            logvar_weight, logvar_bias = _chosen(net.logvar_heads, heads, context)
+            num_envs, members, _, hidden_size, _ = logvar_weight.shape
+            joined = logvar_weight.transpose(0, 1, 3, 2, 4)
+            weights.append(joined.reshape(num_envs, members, hidden_size, -1))
+            biases.append(logvar_bias.reshape(num_envs, members, -1))
+            low, high = net.min_logvar[heads], net.max_logvar[heads]
+        weight = jnp.concatenate(weights, axis=-1).mT.astype(dtype)
+        output = Layer(weight, jnp.concatenate(biases, axis=-1))
+        return cls(hidden, ChosenHeads(output, low, high), delta.std)
+
+    def with_heads(self, heads: ChosenHeads) -> "ImaginedDynamics":
+        """The dynamics of one environment, whose heads have no environment axis."""
+        return ImaginedDynamics(self.hidden, heads, self.delta_std)
+
+    @property
+    def num_members(self) -> int:
+        """Networks in the ensemble."""
+        return self.hidden[0].bias.shape[0]
+
+    @property
+    def stochastic(self) -> bool:
+        """Whether deltas have a variance."""
+        return self.heads.min_logvar is not None
+
+    def sample_delta(
+        self,
+        x: Float[Array, "member in particle candidate"],
+        noise: Float[Array, "member obs particle #candidate"] | None,
+    ) -> Float[Array, "member obs particle candidate"]:
+        """Draw the next delta of one environment in raw units; its mean where `noise` is None.
+
+        Args:
+            x: Raw features, then actions in [-1, 1].
+            noise: Standard normal draws.
+        """
+        for layer in self.hidden:
+            x = swish(layer(x))
+        out = self.heads.layer(x)
+        obs_size = self.delta_std.shape[0]
+        mean = out[:, :obs_size]
+        if noise is None or not self.stochastic:
+            return mean
+        return mean + noise * self._std(out[:, obs_size:])
+
+    def _std(
+        self, logvar: Float[Array, "member choice_obs particle candidate"]
+    ) -> Float[Array, "member obs particle candidate"]:
+        """Standard deviation of the average of the choices' samples, in raw units."""
+        members, choices, obs_size = self.heads.min_logvar.shape
+        logvar = logvar.reshape(members, choices, obs_size, *logvar.shape[2:])
+        low = self.heads.min_logvar[..., None, None]
+        high = self.heads.max_logvar[..., None, None]
+        bounded = bound_logvar(logvar, low, high)
+        scale = self.delta_std[:, None, None]
+        if choices == 1:
+            return jnp.exp(0.5 * bounded[:, 0]) * scale
+        return jnp.sqrt(jnp.exp(bounded).sum(1)) * (scale / choices)
+
+
+def _layer(layer: Dense, dtype) -> Layer:
+    return Layer(layer.weight.mT.astype(dtype), layer.bias)
+
+
+def _fold_input(layer: Dense, statistics: Statistics) -> Dense:
+    """Let the first layer take raw features and actions."""
+    scale = jnp.concatenate([statistics.features.scale, statistics.action.scale])
+    mean = jnp.concatenate([statistics.features.mean, statistics.action.mean])
+    weight = layer.weight / scale[:, None]
+    return Dense(weight, layer.bias - jnp.einsum("i,mio->mo", mean, weight))
+
+
+def _chosen(
+    layer: DenseHeads,
+    heads: Int[Array, "env member choice"],
+    context: Float[Array, "member env context"] | None,
+) -> tuple[
+    Float[Array, "env member choice hidden obs"], Float[Array, "env member choice obs"]
+]:
+    """Weights and biases of the chosen heads, the context added to the biases."""
+    member = jnp.arange(heads.shape[1])[:, None]
+    weight, bias = layer.weight[member, heads], layer.bias[member, heads]
+    if context is None:
+        return weight, bias
+    hidden_size = weight.shape[-2] - context.shape[-1]
+    bias = bias + jnp.einsum("mec,emkco->emko", context, weight[..., hidden_size:, :])
+    return weight[..., :hidden_size, :], bias
