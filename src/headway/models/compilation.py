@@ -1,4 +1,4 @@
-"""How functions that run the networks are compiled."""
+"""How functions that run the networks are compiled, and where compiled ones are kept."""
 
 import functools
 from collections.abc import Callable
@@ -6,6 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import platformdirs
 
 # Found by measuring on CPUs (docs/performance.md): full-width vectors make the activations
 # faster, and YNNPACK's fusions slow float32 products down but are the only way to fast
@@ -50,3 +51,18 @@ def jit_networks(function: Callable, *, precision: str = "float32") -> Callable:
         return compiled()(*args, **kwargs)
 
     return call
+
+
+def keep_compilations() -> None:
+    """Turn on JAX's persistent compilation cache, unless the user has chosen a folder.
+
+    It lies in the user's cache folder; `JAX_COMPILATION_CACHE_DIR` moves it and
+    `JAX_ENABLE_COMPILATION_CACHE=0` turns it off. JAX looks once, at its first compilation:
+    that is why this runs on import.
+    """
+    if jax.config.jax_compilation_cache_dir is None:
+        folder = platformdirs.user_cache_path("headway", appauthor=False) / "compiled"
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+
+
+keep_compilations()

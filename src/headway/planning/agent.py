@@ -12,8 +12,8 @@ from headway.config import PlannerConfig
 from headway.models.compilation import jit_networks
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.planning.heads import RecentTransitions, head_errors, select_heads
-from headway.planning.optimizers import make_optimizer
 from headway.planning.imagination import ImaginedDynamics
+from headway.planning.optimizers import make_optimizer
 from headway.planning.returns import RolloutSettings, candidate_returns
 from headway.tasks.base import Task
 

@@ -31,8 +31,8 @@ def environments_at_once(num_envs: int, bytes_per_env: int) -> int:
 
 def activation_budget() -> int:
     """Bytes that one array of activations may take, on all devices together."""
-    budgets = [_device_budget(device) for device in jax.local_devices()]
-    return sum(budgets)
+    devices = jax.local_devices()
+    return sum(memory_budget(device.platform, device.memory_stats()) for device in devices)
 
 
 def spread_candidates(x: Array) -> Array:
@@ -45,9 +45,14 @@ def spread_candidates(x: Array) -> Array:
     return jax.lax.with_sharding_constraint(x, NamedSharding(mesh, spec))
 
 
-def _device_budget(device: jax.Device) -> int:
-    stats = device.memory_stats() if device.platform != "cpu" else None
-    if not stats or "bytes_limit" not in stats:
+def memory_budget(platform: str, stats: dict[str, int] | None) -> int:
+    """Bytes that one array of activations may take on one device.
+
+    Args:
+        platform: `cpu`, `gpu`, ...
+        stats: What the device says of its memory; None where it does not.
+    """
+    if platform == "cpu" or not stats or "bytes_limit" not in stats:
         return CPU_BUDGET
     free = stats["bytes_limit"] - stats.get("bytes_in_use", 0)
     return max(free, 0) // ARRAYS

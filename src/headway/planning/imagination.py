@@ -170,9 +170,7 @@ def _chosen(
     layer: DenseHeads,
     heads: Int[Array, "env member choice"],
     context: Float[Array, "member env context"] | None,
-) -> tuple[
-    Float[Array, "env member choice hidden obs"], Float[Array, "env member choice obs"]
-]:
+) -> tuple[Float[Array, "env member choice hidden obs"], Float[Array, "env member choice obs"]]:
     """Weights and biases of the chosen heads, the context added to the biases."""
     member = jnp.arange(heads.shape[1])[:, None]
     weight, bias = layer.weight[member, heads], layer.bias[member, heads]
