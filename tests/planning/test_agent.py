@@ -54,6 +54,9 @@ def test_actions_are_bounded_finite_and_of_the_tasks_shape():
         assert decision.heads.shape == (2, 2)
         assert np.abs(np.asarray(decision.action)).max() <= 1.0
         np.testing.assert_array_equal(decision.failures, 0)
+        np.testing.assert_array_equal(
+            decision.evaluations, TINY.num_candidates * TINY.num_iterations
+        )
 
 
 def test_heads_and_actions_follow_each_environments_own_physics_after_one_step():
@@ -131,17 +134,17 @@ def test_an_environment_without_finite_returns_keeps_its_guess_and_is_counted_al
     _, healthy = agent.act(state, seen[-1])
     after, decision = agent.act(state, np.stack([[np.nan, np.nan], seen[-1][1]]))
     np.testing.assert_array_equal(decision.failures, [TINY.num_iterations, 0])
-    np.testing.assert_array_equal(decision.action[0], state.guess[0, 0])
-    np.testing.assert_array_equal(after.guess[0, :-1], state.guess[0, 1:])
+    np.testing.assert_array_equal(decision.action[0], state.search.guess[0, 0])
+    np.testing.assert_array_equal(after.search.guess[0, :-1], state.search.guess[0, 1:])
     np.testing.assert_array_equal(decision.action[1], healthy.action[1])
 
 
 def test_next_guess_is_the_plan_shifted_by_one_and_ends_in_zero():
     agent = make_agent(optimizer="random-shooting")
     state, decision = agent.act(start(agent), jnp.asarray([[0.5, 0.5], [0.1, -0.4]]))
-    np.testing.assert_array_equal(state.guess[:, -1], 0.0)
-    assert np.asarray(state.guess[:, :-1]).all()
-    assert (state.guess[:, 0] != decision.action).any()
+    np.testing.assert_array_equal(state.search.guess[:, -1], 0.0)
+    assert np.asarray(state.search.guess[:, :-1]).all()
+    assert (state.search.guess[:, 0] != decision.action).any()
 
 
 def test_random_selection_ignores_the_data_and_draws_anew_at_every_step():

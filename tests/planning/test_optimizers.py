@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from headway.config import PlannerConfig
-from headway.planning.optimizers import CEM, RandomShooting, make_optimizer
+from headway.planning.optimizers import CEM, RandomShooting, SearchState, make_optimizer
 
 ROUNDS = 3
 OPTIMIZERS = [
@@ -44,7 +44,12 @@ def optimize(optimizer, target, guess, bad, bad_envs, bad_if_positive, key):
         spoiled = bad_envs[:, None] | (bad_if_positive & (candidates[..., 0, 0] > 0))
         return jnp.where(spoiled, bad, towards(target)(candidates, key))
 
-    return optimizer.optimize(score, guess, key=key)
+    return optimizer.optimize(score, begin(optimizer, guess), key=key)
+
+
+def begin(optimizer, guess):
+    """The optimizer's own first state, but for the guess."""
+    return optimizer.init(*guess.shape)._replace(guess=guess)
 
 
 def search(optimizer, target, *, guess=None, bad=0.0, bad_envs=(), bad_if_positive=False, key=0):
@@ -69,7 +74,7 @@ def push_outwards(optimizer, guess, key):
         assert candidates.shape == (NUM_ENVS, 40, HORIZON, ACTIONS)
         return jnp.abs(candidates).max((-1, -2))
 
-    return optimizer.optimize(largest, guess, key=key)
+    return optimizer.optimize(largest, begin(optimizer, guess), key=key)
 
 
 @pytest.mark.parametrize("guess", [0.0, 0.97, -1.0])
@@ -123,6 +128,30 @@ def test_same_key_same_plan_and_another_key_another(optimizer):
     assert (plans[0] != plans[2]).any()
 
 
+def test_evaluations_are_what_was_really_scored(optimizer):
+    sizes = []
+
+    def score(candidates, key):
+        jax.debug.callback(lambda x: sizes.append(x.shape[1]), candidates)
+        return towards([0.3, -0.3])(candidates, key)
+
+    plan = optimizer.optimize(score, begin(optimizer, start()), key=KEY)
+    jax.effects_barrier()
+    assert len(sizes) == ROUNDS
+    np.testing.assert_array_equal(plan.evaluations, sum(sizes))
+    assert optimizer.max_evaluations == sum(sizes)
+
+
+def test_a_first_state_starts_from_zero_and_shifting_moves_the_plan_on_by_one_step(optimizer):
+    first = optimizer.init(NUM_ENVS, HORIZON, ACTIONS)
+    np.testing.assert_array_equal(first.guess, start())
+    ended = search(optimizer, [0.6, -0.6]).state
+    later = optimizer.shift(ended)
+    np.testing.assert_array_equal(later.guess[:, :-1], ended.guess[:, 1:])
+    np.testing.assert_array_equal(later.guess[:, -1], 0.0)
+    assert jax.tree.map(jnp.shape, later) == jax.tree.map(jnp.shape, first)
+
+
 def test_environments_draw_different_candidates(optimizer):
     plan = search(optimizer, [0.5, 0.5])
     assert (plan.actions[0] != plan.actions[1]).any()
@@ -137,7 +166,7 @@ def test_a_round_of_cem_equals_its_numpy_twin():
         jax.debug.callback(lambda x: captured.append(np.float64(x)), candidates)
         return towards([0.9, 0.1])(candidates, key)
 
-    plan = cem.optimize(score, guess, key=KEY)
+    plan = cem.optimize(score, SearchState(guess), key=KEY)
     jax.effects_barrier()
     (candidates,) = captured
     room = 0.25  # (1 - 0.5) / 2: closer than the initial deviation
@@ -159,7 +188,7 @@ def test_variance_of_cem_shrinks_by_the_elites_variance_and_the_smoothing():
         return towards([0.1, -0.1])(candidates, key)
 
     cem = CEM(num_candidates=4000, num_elites=400, num_iterations=2, smoothing=0.1)
-    cem.optimize(score, start(), key=KEY)
+    cem.optimize(score, SearchState(start()), key=KEY)
     jax.effects_barrier()
     first, second = captured
     for env, aim in enumerate([0.1, -0.1]):
@@ -177,7 +206,9 @@ def test_with_fewer_finite_candidates_than_elites_only_the_finite_ones_count():
         return jnp.broadcast_to(returns, candidates.shape[:2])
 
     plans = [
-        CEM(num_candidates=40, num_elites=n, num_iterations=1).optimize(only_one, start(), key=KEY)
+        CEM(num_candidates=40, num_elites=n, num_iterations=1).optimize(
+            only_one, SearchState(start()), key=KEY
+        )
         for n in (1, 8)
     ]
     np.testing.assert_allclose(plans[0].actions, plans[1].actions, atol=1e-7)
@@ -215,7 +246,9 @@ def test_cem_beats_random_shooting_with_as_many_candidates_and_nears_the_optimum
 
     @eqx.filter_jit
     def plan(optimizer, key):
-        return score(optimizer.optimize(score, guess, key=key).actions[:, None], None)
+        return score(
+            optimizer.optimize(score, begin(optimizer, guess), key=key).actions[:, None], None
+        )
 
     def achieved(optimizer, key):
         return np.asarray(plan(optimizer, jax.random.key(key)))[:, 0]
