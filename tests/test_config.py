@@ -50,6 +50,13 @@ def test_settings_may_be_left_out_and_take_their_defaults():
         from_dict({})
 
 
+def test_a_run_of_before_the_newest_settings_takes_their_defaults():
+    old = to_dict(changed())
+    for name in ("warm_variance", "warm_min_std", "settle_tolerance"):
+        del old["planner"][name]
+    assert from_dict(json.loads(json.dumps(old))) == changed()
+
+
 def test_defaults_are_the_papers():
     config = Config(env="hopper")
     model, fitting, planner = config.model, config.fitting, config.planner
@@ -167,6 +174,8 @@ def test_a_section_that_is_no_table_is_refused(value):
         (FittingConfig, {"learning_rate": float("nan"), "logvar_bound_weight": float("inf")}),
         (PlannerConfig, {"horizon": 0, "num_elites": 300, "smoothing": 1.5, "optimizer": "sem"}),
         (PlannerConfig, {"reward": "paper", "selection_error": "raw", "initial_std": 0.0}),
+        (PlannerConfig, {"warm_min_std": 0.0, "settle_tolerance": -0.1}),
+        (PlannerConfig, {"warm_min_std": 20.0, "settle_tolerance": float("nan")}),
         (CollectionConfig, {"num_iterations": 0, "num_episodes": 0, "episode_length": -1}),
         (EvaluationConfig, {"every": 0, "num_episodes": 0, "seed": -1, "training_group": "no"}),
     ],

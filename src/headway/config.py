@@ -154,6 +154,14 @@ class PlannerConfig:
     """Share of the old mean and variance that is kept at each CEM iteration."""
     initial_std: float = 0.5
     """Standard deviation of CEM's first candidates, actions being scaled to [-1, 1]."""
+    warm_variance: bool = False
+    """Whether CEM starts from the variance of the last plan, shifted by one step as its mean is;
+    the other optimizers take no notice."""
+    warm_min_std: float = 0.1
+    """Least standard deviation to start from with `warm_variance`; without it, unused."""
+    settle_tolerance: float = 0.0
+    """CEM ends a search early where an iteration moved the mean by less than this (root mean
+    square over the plan, actions in [-1, 1]); 0 never does. Unused by the other optimizers."""
     num_particles: int = 20
     """Imagined rollouts per candidate; a multiple of `model.num_members`."""
     head_selection: HeadSelection = "adaptive"
@@ -175,7 +183,8 @@ class PlannerConfig:
         )
         problems.at_least(1, "selection_length")
         problems.between(0.0, 1.0, "smoothing")
-        problems.between(1e-6, 10.0, "initial_std")
+        problems.between(1e-6, 10.0, "initial_std", "warm_min_std")
+        problems.at_least(0, "settle_tolerance")
         problems.one_of("optimizer", ("cem", "random-shooting"))
         problems.one_of("head_selection", typing.get_args(HeadSelection))
         problems.one_of("selection_error", ("mean", "sampled"))

@@ -17,10 +17,15 @@ Tree = TypeVar("Tree")
 
 
 class SearchState(NamedTuple):
-    """What a search starts from, and what it hands on to the search of the next step."""
+    """What a search starts from, and what it hands on to the search of the next step.
+
+    Every optimizer fills what it uses; what is None takes no memory.
+    """
 
     guess: Float[Array, "env horizon action"]
     """Where to start, within [-1, 1]; also the answer if every return is non-finite."""
+    variance: Float[Array, "env horizon action"] | None = None
+    """How widely to search around the guess."""
 
 
 class Plan(NamedTuple):
