@@ -1,5 +1,7 @@
 """What every optimizer must keep to, and how well each searches a problem with a known answer."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,11 +10,12 @@ import pytest
 from search_helpers import ACTIONS, HORIZON, KEY, NUM_ENVS, begin, search, start, towards, watch
 
 from headway.config import PlannerConfig
-from headway.planning.optimizers import CEM, RandomShooting, make_optimizer
+from headway.planning.optimizers import CEM, ICEM, RandomShooting, make_optimizer
 
 ROUNDS = 3
 OPTIMIZERS = [
     CEM(num_candidates=40, num_elites=8, num_iterations=ROUNDS),
+    ICEM(num_candidates=40, num_elites=8, num_iterations=ROUNDS),
     RandomShooting(num_candidates=40, num_iterations=ROUNDS),
 ]
 
@@ -28,7 +31,8 @@ def push_outwards(optimizer, guess, key):
 
     def largest(candidates, key):
         del key
-        assert candidates.shape == (NUM_ENVS, 40, HORIZON, ACTIONS)
+        assert candidates.shape[0] == NUM_ENVS
+        assert candidates.shape[2:] == (HORIZON, ACTIONS)
         return jnp.abs(candidates).max((-1, -2))
 
     return optimizer.optimize(largest, begin(optimizer, guess), key=key)
@@ -99,7 +103,8 @@ def test_a_first_state_starts_from_zero_and_shifting_moves_the_plan_on_by_one_st
     ended = search(optimizer, [0.6, -0.6]).state
     later = optimizer.shift(ended)
     np.testing.assert_array_equal(later.guess[:, :-1], ended.guess[:, 1:])
-    np.testing.assert_array_equal(later.guess[:, -1], 0.0)
+    repeats = isinstance(optimizer, ICEM)
+    np.testing.assert_array_equal(later.guess[:, -1], ended.guess[:, -1] if repeats else 0.0)
     assert jax.tree.map(jnp.shape, later) == jax.tree.map(jnp.shape, first)
 
 
@@ -113,6 +118,11 @@ def test_settings_reach_the_optimizer():
         num_candidates=9, num_elites=3, num_iterations=2, smoothing=0.3, initial_std=0.4
     )
     assert make_optimizer(config) == CEM(9, 3, 2, 0.3, 0.4)
+    warm = dataclasses.replace(config, warm_variance=True, warm_min_std=0.2, settle_tolerance=0.1)
+    assert make_optimizer(warm) == CEM(9, 3, 2, 0.3, 0.4, True, 0.2, 0.1)
+    memory = {"noise_beta": 1.5, "population_decay": 1.1, "kept_elite_fraction": 0.7}
+    icem = dataclasses.replace(config, optimizer="icem", **memory)
+    assert make_optimizer(icem) == ICEM(9, 3, 2, 0.3, 0.4, **memory)
     shooting = PlannerConfig(
         optimizer="random-shooting", num_candidates=9, num_elites=3, num_iterations=2
     )

@@ -26,6 +26,8 @@ class SearchState(NamedTuple):
     """Where to start, within [-1, 1]; also the answer if every return is non-finite."""
     variance: Float[Array, "env horizon action"] | None = None
     """How widely to search around the guess."""
+    elites: Float[Array, "env elite horizon action"] | None = None
+    """Good sequences to try again; infinite where an action is unknown, to be drawn."""
 
 
 class Plan(NamedTuple):
@@ -85,10 +87,3 @@ def where_env(condition: Bool[Array, " env"], chosen: Tree, other: Tree) -> Tree
         return jnp.where(condition.reshape(-1, *[1] * (x.ndim - 1)), x, y)
 
     return jax.tree.map(pick, chosen, other)
-
-
-def rank_non_finite_last(
-    returns: Float[Array, "env candidate"],
-) -> Float[Array, "env candidate"]:
-    """Turn every non-finite return into -inf, so that it ranks last."""
-    return jnp.where(jnp.isfinite(returns), returns, -jnp.inf)

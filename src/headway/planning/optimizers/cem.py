@@ -11,10 +11,10 @@ from headway.planning.optimizers.base import (
     Plan,
     Score,
     SearchState,
-    rank_non_finite_last,
     shift_steps,
     where_env,
 )
+from headway.planning.optimizers.ranking import best_candidates, moments, rank_non_finite_last
 
 
 class CEM(Optimizer):
@@ -105,9 +105,8 @@ class CEM(Optimizer):
         candidates = self._draw(search.mean, search.var, draw_key)
         returns = rank_non_finite_last(score(candidates, score_key))
         # The elites: the best candidates, those with a finite return only.
-        elite_returns, elite = jax.lax.top_k(returns, self.num_elites)
+        elites, elite_returns = best_candidates(candidates, returns, self.num_elites)
         finite = jnp.isfinite(elite_returns)
-        elites = jnp.take_along_axis(candidates, elite[:, :, None, None], axis=1)
         new_mean, new_var = moments(elites, finite)
         # Keep a share of the old distribution; keep all of it when nothing was finite.
         found = finite.any(-1)
@@ -144,12 +143,3 @@ class _Search(NamedTuple):
     failures: Int[Array, " env"]
     evaluations: Int[Array, " env"]
     settled: Bool[Array, " env"]
-
-
-def moments(
-    elites: Float[Array, "env elite horizon action"], counted: Bool[Array, "env elite"]
-) -> tuple[Float[Array, "env horizon action"], Float[Array, "env horizon action"]]:
-    """Mean and population variance over the counted elites."""
-    weight = counted[..., None, None] / jnp.maximum(counted.sum(-1), 1)[:, None, None, None]
-    mean = (weight * elites).sum(1)
-    return mean, (weight * jnp.square(elites - mean[:, None])).sum(1)

@@ -5,9 +5,14 @@ import dataclasses
 from headway.config import PlannerConfig
 from headway.planning.optimizers.base import Optimizer
 from headway.planning.optimizers.cem import CEM
+from headway.planning.optimizers.icem import ICEM
 from headway.planning.optimizers.shooting import RandomShooting
 
-_OPTIMIZERS: dict[str, type[Optimizer]] = {"cem": CEM, "random-shooting": RandomShooting}
+_OPTIMIZERS: dict[str, type[Optimizer]] = {
+    "cem": CEM,
+    "icem": ICEM,
+    "random-shooting": RandomShooting,
+}
 
 
 def make_optimizer(config: PlannerConfig) -> Optimizer:

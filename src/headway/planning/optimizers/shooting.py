@@ -4,13 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from headway.planning.optimizers.base import (
-    Optimizer,
-    Plan,
-    Score,
-    SearchState,
-    rank_non_finite_last,
-)
+from headway.planning.optimizers.base import Optimizer, Plan, Score, SearchState
+from headway.planning.optimizers.ranking import rank_non_finite_last
 
 
 class RandomShooting(Optimizer):
