@@ -15,7 +15,7 @@ from headway.errors import ConfigError
 from headway.sim_params import SimParamSets
 
 Oracle = Literal["independent", "transition", "trajectory"]
-OptimizerName = Literal["cem", "icem", "random-shooting"]
+OptimizerName = Literal["cem", "icem", "mppi", "random-shooting"]
 HeadSelection = Literal["adaptive", "average", "random"]
 
 
@@ -154,7 +154,8 @@ class PlannerConfig:
     smoothing: float = 0.1
     """Share of the old mean and spread that is kept at each iteration (CEM, iCEM)."""
     initial_std: float = 0.5
-    """Standard deviation of the first candidates, actions being scaled to [-1, 1] (CEM, iCEM)."""
+    """Standard deviation of the first candidates, actions being scaled to [-1, 1] (CEM, iCEM);
+    of all candidates (MPPI)."""
     warm_variance: bool = False
     """Whether to start from the variance of the last plan, shifted by one step as its mean is
     (CEM)."""
@@ -165,11 +166,14 @@ class PlannerConfig:
     over the plan, actions being scaled to [-1, 1]; 0 never does (CEM)."""
     noise_beta: float = 2.0
     """Exponent of the noise's power spectrum over the horizon: 0 white, 1 pink, 2 red; smoother
-    for slow systems (iCEM)."""
+    for slow systems (iCEM, MPPI)."""
     population_decay: float = 1.25
     """Factor by which each iteration draws fewer candidates, down to twice the elites (iCEM)."""
     kept_elite_fraction: float = 0.3
     """Share of the elites that competes again in the next iteration and at the next step (iCEM)."""
+    temperature: float = 0.5
+    """Softness of the weights exp(return / temperature), the returns of an iteration being
+    standardised: less looks at the best candidates only (MPPI)."""
     num_particles: int = 20
     """Imagined rollouts per candidate; a multiple of `model.num_members`."""
     head_selection: HeadSelection = "adaptive"
@@ -196,13 +200,14 @@ class PlannerConfig:
         problems.between(0.0, 10.0, "noise_beta")
         problems.at_least(1, "population_decay")
         problems.between(0.0, 1.0, "kept_elite_fraction")
+        problems.between(1e-6, 1e6, "temperature")
         problems.one_of("optimizer", typing.get_args(OptimizerName))
         problems.one_of("head_selection", typing.get_args(HeadSelection))
         problems.one_of("selection_error", ("mean", "sampled"))
         problems.one_of("reward", ("task", "released"))
-        share = {"icem": 2}.get(self.optimizer, 1)
+        share = {"icem": 2, "mppi": 0, "random-shooting": 0}.get(self.optimizer, 1)
         problems.require(
-            self.optimizer == "random-shooting" or share * self.num_elites <= self.num_candidates,
+            share * self.num_elites <= self.num_candidates,
             f"num_elites is {self.num_elites}, allowed: at most {'half of ' * (share == 2)}"
             f"num_candidates ({self.num_candidates})",
         )

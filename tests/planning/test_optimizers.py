@@ -10,12 +10,13 @@ import pytest
 from search_helpers import ACTIONS, HORIZON, KEY, NUM_ENVS, begin, search, start, towards, watch
 
 from headway.config import PlannerConfig
-from headway.planning.optimizers import CEM, ICEM, RandomShooting, make_optimizer
+from headway.planning.optimizers import CEM, ICEM, MPPI, RandomShooting, make_optimizer
 
 ROUNDS = 3
 OPTIMIZERS = [
     CEM(num_candidates=40, num_elites=8, num_iterations=ROUNDS),
     ICEM(num_candidates=40, num_elites=8, num_iterations=ROUNDS),
+    MPPI(num_candidates=40, num_iterations=ROUNDS),
     RandomShooting(num_candidates=40, num_iterations=ROUNDS),
 ]
 
@@ -123,6 +124,8 @@ def test_settings_reach_the_optimizer():
     memory = {"noise_beta": 1.5, "population_decay": 1.1, "kept_elite_fraction": 0.7}
     icem = dataclasses.replace(config, optimizer="icem", **memory)
     assert make_optimizer(icem) == ICEM(9, 3, 2, 0.3, 0.4, **memory)
+    mppi = dataclasses.replace(icem, optimizer="mppi", temperature=0.7)
+    assert make_optimizer(mppi) == MPPI(9, 2, 0.4, 1.5, 0.7)
     shooting = PlannerConfig(
         optimizer="random-shooting", num_candidates=9, num_elites=3, num_iterations=2
     )

@@ -12,5 +12,6 @@ from headway.planning.optimizers.base import where_env as where_env
 from headway.planning.optimizers.cem import CEM as CEM
 from headway.planning.optimizers.icem import ICEM as ICEM
 from headway.planning.optimizers.making import make_optimizer as make_optimizer
+from headway.planning.optimizers.mppi import MPPI as MPPI
 from headway.planning.optimizers.ranking import rank_non_finite_last as rank_non_finite_last
 from headway.planning.optimizers.shooting import RandomShooting as RandomShooting

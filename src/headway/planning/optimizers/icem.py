@@ -48,7 +48,7 @@ class ICEM(Optimizer):
     @property
     def num_kept(self) -> int:
         """Elites that compete once more."""
-        return int(self.kept_elite_fraction * self.num_elites)
+        return round(self.kept_elite_fraction * self.num_elites)
 
     @property
     def max_evaluations(self) -> int:

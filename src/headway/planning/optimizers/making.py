@@ -6,11 +6,13 @@ from headway.config import PlannerConfig
 from headway.planning.optimizers.base import Optimizer
 from headway.planning.optimizers.cem import CEM
 from headway.planning.optimizers.icem import ICEM
+from headway.planning.optimizers.mppi import MPPI
 from headway.planning.optimizers.shooting import RandomShooting
 
 _OPTIMIZERS: dict[str, type[Optimizer]] = {
     "cem": CEM,
     "icem": ICEM,
+    "mppi": MPPI,
     "random-shooting": RandomShooting,
 }
 
