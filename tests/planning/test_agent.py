@@ -95,6 +95,21 @@ def test_history_of_a_real_episode_equals_that_of_its_trajectory(selection_lengt
         np.testing.assert_array_equal(got.action, want.action)
 
 
+@pytest.mark.parametrize(
+    "settings",
+    [{"warm_variance": True}, {"optimizer": "icem", "num_iterations": 2}, {"optimizer": "mppi"}],
+    ids=str,
+)
+def test_act_is_traced_once_whatever_the_optimizer_remembers(settings, monkeypatch):
+    traces = []
+    original = agent_module.encode
+    monkeypatch.setattr(agent_module, "encode", lambda *x: traces.append(1) or original(*x))
+    agent = make_agent(initial_std=0.4321, **settings)
+    state, _, _ = play(agent, [1.0, -1.0], 2)
+    play(agent, [1.0, -1.0], 2, state=reset_where(state, start(agent), jnp.asarray([True, False])))
+    assert len(traces) == 1
+
+
 def test_act_is_traced_once_over_episodes_steps_and_new_weights(monkeypatch):
     traces = []
     original = agent_module.encode

@@ -58,7 +58,8 @@ class ICEM(Optimizer):
     def init(self, num_envs: int, horizon: int, action_size: int) -> SearchState:
         """See `Optimizer.init`; there are no elites yet."""
         state = super().init(num_envs, horizon, action_size)
-        unknown = jnp.full((num_envs, self.num_kept, horizon, action_size), jnp.inf)
+        shape = (num_envs, self.num_kept, horizon, action_size)
+        unknown = jnp.full(shape, jnp.inf, state.guess.dtype)
         return state._replace(elites=unknown)
 
     def optimize(self, score: Score, state: SearchState, *, key: PRNGKeyArray) -> Plan:
