@@ -1,6 +1,5 @@
 """One planning step at the paper's HalfCheetah size, and the memory it takes."""
 
-import itertools
 import resource
 import subprocess
 import sys
@@ -13,6 +12,7 @@ import pytest
 from headway.config import ModelConfig, PlannerConfig
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.planning.agent import Agent, AgentState
+from headway.planning.flop import plan_flop
 from headway.tasks.catalog import env_spec
 
 MODEL = ModelConfig()
@@ -30,20 +30,11 @@ def make_agent(num_envs: int) -> tuple[Agent, AgentState, jax.Array]:
     return agent, state, obs
 
 
-def plan_flop(agent: Agent) -> float:
-    """Floating-point operations of the matrix products of one environment's plan."""
-    *hidden, features = (agent.task.feature_size + agent.task.action_size, *MODEL.hidden_sizes)
-    sizes = (*hidden, features, 2 * agent.task.obs_size)
-    per_call = 2 * sum(n * m for n, m in itertools.pairwise(sizes))
-    imagined = PLANNER.num_candidates * PLANNER.num_particles * PLANNER.horizon
-    return float(per_call * imagined * PLANNER.num_iterations)
-
-
 @pytest.mark.parametrize("num_envs", [1, 10])
 def test_plan(num_envs, timed, report):
     agent, state, obs = make_agent(num_envs)
     timing = timed(lambda: agent.act(state, obs), rounds=7 if num_envs == 1 else 3)
-    flop = num_envs * plan_flop(agent)
+    flop = num_envs * plan_flop(MODEL, PLANNER, agent.task)
     report.add(f"plan, {num_envs} env", timing.seconds, "s", **timing.ratio(flop))
 
 

@@ -50,6 +50,19 @@ def test_settings_may_be_left_out_and_take_their_defaults():
         from_dict({})
 
 
+NEW_PLANNER_SETTINGS = (
+    "warm_variance", "warm_min_std", "settle_tolerance",
+    "noise_beta", "population_decay", "kept_elite_fraction", "temperature",
+)  # fmt: skip
+
+
+def test_a_run_of_before_the_newest_settings_takes_their_defaults():
+    old = to_dict(changed())
+    for name in NEW_PLANNER_SETTINGS:
+        del old["planner"][name]
+    assert from_dict(json.loads(json.dumps(old))) == changed()
+
+
 def test_defaults_are_the_papers():
     config = Config(env="hopper")
     model, fitting, planner = config.model, config.fitting, config.planner
@@ -167,6 +180,10 @@ def test_a_section_that_is_no_table_is_refused(value):
         (FittingConfig, {"learning_rate": float("nan"), "logvar_bound_weight": float("inf")}),
         (PlannerConfig, {"horizon": 0, "num_elites": 300, "smoothing": 1.5, "optimizer": "sem"}),
         (PlannerConfig, {"reward": "paper", "selection_error": "raw", "initial_std": 0.0}),
+        (PlannerConfig, {"warm_min_std": 0.0, "settle_tolerance": -0.1}),
+        (PlannerConfig, {"warm_min_std": 20.0, "settle_tolerance": float("nan")}),
+        (PlannerConfig, {"temperature": 0.0}),
+        (PlannerConfig, {"noise_beta": -1.0, "population_decay": 0.9, "kept_elite_fraction": 1.1}),
         (CollectionConfig, {"num_iterations": 0, "num_episodes": 0, "episode_length": -1}),
         (EvaluationConfig, {"every": 0, "num_episodes": 0, "seed": -1, "training_group": "no"}),
     ],
@@ -203,6 +220,10 @@ def test_a_misspelt_choice_is_suggested():
 
 
 def test_settings_that_contradict_each_other_are_refused():
+    with pytest.raises(ConfigError, match=r"num_elites is 50, allowed: at most half of .*\(80\)"):
+        PlannerConfig(optimizer="icem", num_candidates=80)
+    assert PlannerConfig(optimizer="icem", num_candidates=100).num_elites == 50
+    assert PlannerConfig(optimizer="mppi", num_candidates=20).num_elites == 50
     with pytest.raises(ConfigError, match="nothing of a selection_length of 1"):
         PlannerConfig(selection_skips_newest=True, selection_length=1)
     with pytest.raises(ConfigError, match=r"num_particles is 7, allowed: a multiple of.*\(5\)"):

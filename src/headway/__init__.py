@@ -11,6 +11,7 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from headway.api import Evaluation as Evaluation
     from headway.api import Run as Run
     from headway.api import evaluate as evaluate
     from headway.api import load as load
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
     from headway.planning.agent import Agent as Agent
     from headway.planning.controller import Controller as Controller
     from headway.planning.optimizers import CEM as CEM
+    from headway.planning.optimizers import ICEM as ICEM
+    from headway.planning.optimizers import MPPI as MPPI
     from headway.planning.optimizers import RandomShooting as RandomShooting
     from headway.report.dynamics import plot_dynamics as plot_dynamics
     from headway.sim_params import SimParamSets as SimParamSets
@@ -44,7 +47,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "api": ("Run", "evaluate", "load", "train"),
+    "api": ("Evaluation", "Run", "evaluate", "load", "train"),
     "config": ("Config",),
     "data": ("ReplayBuffer", "Trajectory"),
     "errors": (
@@ -60,7 +63,7 @@ _HOME = {
     "models.dynamics": ("MultiHeadDynamics",),
     "planning.agent": ("Agent",),
     "planning.controller": ("Controller",),
-    "planning.optimizers": ("CEM", "RandomShooting"),
+    "planning.optimizers": ("CEM", "ICEM", "MPPI", "RandomShooting"),
     "report.dynamics": ("plot_dynamics",),
     "sim_params": ("SimParamSets",),
     "tasks.base": ("Task",),

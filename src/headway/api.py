@@ -3,14 +3,14 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import jax
 
 from headway.config import Config
 from headway.errors import unknown_name
-from headway.experiment.evaluation import episode_rows, evaluate_agent
-from headway.experiment.methods import make_config
+from headway.experiment.evaluation import PlanningCost, episode_rows, evaluate_agent
+from headway.experiment.methods import make_config, tested_config
 from headway.experiment.progress import Progress
 from headway.experiment.rollouts import Arena
 from headway.experiment.runs import EpisodeRow, RunDir
@@ -37,6 +37,28 @@ class Run:
     def controller(self, *, seed: int = 0) -> Controller:
         """The trained controller."""
         return load(self.path, seed=seed)
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation(Sequence[EpisodeRow]):
+    """Test episodes of a trained run, one after the other, and what planning them took."""
+
+    rows: list[EpisodeRow]
+    """Every test episode."""
+    config: Config
+    """All settings, as they were tested."""
+    cost: PlanningCost
+    """Candidates, arithmetic and time per step."""
+
+    @overload
+    def __getitem__(self, index: int) -> EpisodeRow: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[EpisodeRow]: ...
+    def __getitem__(self, index):
+        return self.rows[index]
+
+    def __len__(self) -> int:
+        return len(self.rows)
 
 
 def train(
@@ -78,40 +100,45 @@ def evaluate(
     *,
     groups: Sequence[str] | None = None,
     num_episodes: int | None = None,
+    settings: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
-) -> list[EpisodeRow]:
+) -> Evaluation:
     """Test a trained run once more; nothing in its directory changes.
 
     Args:
         run_dir: The run directory.
         groups: `train` or unseen groups; all of them by default.
         num_episodes: Episodes per group; the run's own number by default.
+        settings: Changes of `planner` and `evaluation` settings by dotted name, for example
+            `{"planner.num_candidates": 50}`, to test the model with another planner.
         progress: Shown while testing; silent by default.
 
     Raises:
         RunError: There is no trained run, or it is damaged.
         UnknownNameError: No such group.
-        ConfigError: `num_episodes` is out of range.
+        ConfigError: A setting is unknown, of the wrong type or out of range, or one that
+            training has fixed.
     """
     run = RunDir(run_dir)
-    config = run.config()
-    agent = load_agent(run)
+    changes = dict(settings or {})
+    if num_episodes is not None:
+        changes["evaluation.num_episodes"] = num_episodes
+    config = tested_config(run.config(), changes)
+    agent = load_agent(run, config)
     arena = Arena.make(config)
     known = arena.sim_params.group_names
     for group in groups or ():
         if group not in known:
             raise unknown_name("group", group, known)
     groups = list(dict.fromkeys(groups or known))
-    if num_episodes is not None:
-        testing = dataclasses.replace(config.evaluation, num_episodes=num_episodes)
-        config = dataclasses.replace(config, evaluation=testing)
     iteration = run.finished_iterations - 1
     with progress or Progress() as shown:
         total = len(groups) * config.evaluation.num_episodes * arena.episode_length
         shown.phase(iteration, run.finished_iterations, "evaluate", total)
         key = jax.random.key(config.evaluation.seed)
-        found, _ = evaluate_agent(agent, arena, config, groups, key=key, on_step=shown.advance)
-    return episode_rows(config, iteration, found)
+        found, use = evaluate_agent(agent, arena, config, groups, key=key, on_step=shown.advance)
+    rows = episode_rows(config, iteration, found)
+    return Evaluation(rows, config, PlanningCost.of(use, config, arena.task))
 
 
 def load(run_dir: str | Path, *, seed: int = 0) -> Controller:

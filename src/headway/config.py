@@ -15,6 +15,7 @@ from headway.errors import ConfigError
 from headway.sim_params import SimParamSets
 
 Oracle = Literal["independent", "transition", "trajectory"]
+OptimizerName = Literal["cem", "icem", "mppi", "random-shooting"]
 HeadSelection = Literal["adaptive", "average", "random"]
 
 
@@ -140,20 +141,39 @@ class FittingConfig:
 class PlannerConfig:
     """How actions are chosen with the model (supplement A.2; fact sheet C)."""
 
-    optimizer: Literal["cem", "random-shooting"] = "cem"
-    """What searches for the best action sequence."""
+    optimizer: OptimizerName = "cem"
+    """What searches for the best action sequence; settings below name those they matter to."""
     horizon: int = 30
     """Imagined steps."""
     num_candidates: int = 200
-    """Action sequences per optimizer iteration."""
+    """Action sequences drawn per optimizer iteration; in the first one with iCEM."""
     num_elites: int = 50
-    """Best candidates that shape the next iteration (CEM)."""
+    """Best candidates that shape the next iteration (CEM; iCEM, whose paper takes 10)."""
     num_iterations: int = 5
     """Optimizer iterations per plan; random shooting draws new candidates in each."""
     smoothing: float = 0.1
-    """Share of the old mean and variance that is kept at each CEM iteration."""
+    """Share of the old mean and spread that is kept at each iteration (CEM, iCEM)."""
     initial_std: float = 0.5
-    """Standard deviation of CEM's first candidates, actions being scaled to [-1, 1]."""
+    """Standard deviation of the first candidates, actions being scaled to [-1, 1] (CEM, iCEM);
+    of all candidates (MPPI)."""
+    warm_variance: bool = False
+    """Whether to start from the variance of the last plan, shifted by one step as its mean is
+    (CEM)."""
+    warm_min_std: float = 0.1
+    """Least standard deviation to start from with `warm_variance` (CEM)."""
+    settle_tolerance: float = 0.0
+    """A search ends early where an iteration moved the mean by less than this, root mean square
+    over the plan, actions being scaled to [-1, 1]; 0 never does (CEM)."""
+    noise_beta: float = 2.0
+    """Exponent of the noise's power spectrum over the horizon: 0 white, 1 pink, 2 red; smoother
+    for slow systems (iCEM, MPPI)."""
+    population_decay: float = 1.25
+    """Factor by which each iteration draws fewer candidates, down to twice the elites (iCEM)."""
+    kept_elite_fraction: float = 0.3
+    """Share of the elites that competes again in the next iteration and at the next step (iCEM)."""
+    temperature: float = 0.5
+    """Softness of the weights exp(return / temperature), the returns of an iteration being
+    standardised: less looks at the best candidates only (MPPI)."""
     num_particles: int = 20
     """Imagined rollouts per candidate; a multiple of `model.num_members`."""
     particle_noise: Literal["independent", "shared"] = "independent"
@@ -180,17 +200,23 @@ class PlannerConfig:
         )
         problems.at_least(1, "selection_length")
         problems.between(0.0, 1.0, "smoothing")
-        problems.between(1e-6, 10.0, "initial_std")
-        problems.one_of("optimizer", ("cem", "random-shooting"))
+        problems.between(1e-6, 10.0, "initial_std", "warm_min_std")
+        problems.at_least(0, "settle_tolerance")
+        problems.between(0.0, 10.0, "noise_beta")
+        problems.at_least(1, "population_decay")
+        problems.between(0.0, 1.0, "kept_elite_fraction")
+        problems.between(1e-6, 1e6, "temperature")
+        problems.one_of("optimizer", typing.get_args(OptimizerName))
         problems.one_of("head_selection", typing.get_args(HeadSelection))
         problems.one_of("selection_error", ("mean", "sampled"))
         problems.one_of("reward", ("task", "released"))
         problems.one_of("particle_noise", ("independent", "shared"))
         problems.one_of("precision", ("float32", "bfloat16"))
+        share = {"icem": 2, "mppi": 0, "random-shooting": 0}.get(self.optimizer, 1)
         problems.require(
-            self.optimizer == "random-shooting" or self.num_elites <= self.num_candidates,
-            f"num_elites is {self.num_elites}, allowed: at most num_candidates"
-            f" ({self.num_candidates})",
+            share * self.num_elites <= self.num_candidates,
+            f"num_elites is {self.num_elites}, allowed: at most {'half of ' * (share == 2)}"
+            f"num_candidates ({self.num_candidates})",
         )
         problems.require(
             not (self.selection_skips_newest and self.selection_length == 1),

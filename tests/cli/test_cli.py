@@ -9,8 +9,9 @@ from headway import api
 from headway.cli import main
 from headway.cli.commands import parse_train
 from headway.errors import RunError
+from headway.experiment.evaluation import PlanningCost
 from headway.experiment.methods import METHODS, PRESETS, make_config
-from headway.experiment.runs import EpisodeRow
+from headway.experiment.runs import EpisodeRow, RunDir
 from headway.settings import override
 
 
@@ -52,11 +53,20 @@ def calls(monkeypatch, tmp_path):
 
     def evaluate(run_dir, **asked):
         made.append({"run_dir": run_dir, **asked})
-        return ROWS
+        cost = PlanningCost(300.0, 2.5e9, 0.0125)
+        return api.Evaluation(ROWS, make_config("pendulum"), cost)
 
     monkeypatch.setattr(api, "train", train)
     monkeypatch.setattr(api, "evaluate", evaluate)
     return made
+
+
+@pytest.fixture
+def trained(tmp_path):
+    """A run directory as far as its settings go."""
+    run_dir = RunDir(tmp_path / "trained")
+    run_dir.create_or_resume(make_config("pendulum", preset="quick"))
+    return str(run_dir.path)
 
 
 def test_top_help_and_version(capsys):
@@ -80,6 +90,12 @@ USAGE = [
     (["train", "pendulum", "--fitting.oracle", "trajectroy"], "Did you mean 'trajectory'?"),
     (["evaluate"], "missing argument RUN"),
     (["evaluate", "run", "--episodes", "many"], "is 'many', allowed: a whole number"),
+    (
+        ["evaluate", "run", "--planner.num-candidate", "9"],
+        "Did you mean '--planner.num-candidates'?",
+    ),
+    (["evaluate", "run", "--planner.optimizer", "icm"], "Did you mean 'icem'?"),
+    (["evaluate", "run", "--model.num-heads", "9"], "unknown option '--model.num-heads'"),
     (["list", "env"], "Did you mean 'envs'?"),
     (["plot-dynamics", "pendulum", "--num-states", "0"], "--num-states is 0"),
 ]
@@ -121,12 +137,12 @@ def test_values_out_of_range_are_left_to_the_library(capsys):
     assert "num_elites is 900, allowed: at most num_candidates (200)" in err
 
 
-def test_errors_of_several_lines_are_joined(capsys, monkeypatch):
+def test_errors_of_several_lines_are_joined(capsys, monkeypatch, trained):
     def fail(*_, **__):
         raise RunError("two\nlines")
 
     monkeypatch.setattr(api, "evaluate", fail)
-    assert run(capsys, "evaluate", "somewhere") == (1, "", "error: two lines\n")
+    assert run(capsys, "evaluate", trained) == (1, "", "error: two lines\n")
 
 
 def test_evaluating_what_is_no_run(capsys, tmp_path):
@@ -136,12 +152,12 @@ def test_evaluating_what_is_no_run(capsys, tmp_path):
 
 
 @pytest.mark.parametrize(("command", "advice"), [("train", "goes on after"), ("evaluate", "")])
-def test_ctrl_c_exits_130_with_one_line(capsys, monkeypatch, command, advice):
+def test_ctrl_c_exits_130_with_one_line(capsys, monkeypatch, trained, command, advice):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(api, command, interrupt)
-    code, out, err = run(capsys, command, "pendulum")
+    code, out, err = run(capsys, command, {"train": "pendulum", "evaluate": trained}[command])
     assert (code, out) == (130, "")
     assert err.count("\n") == 1
     assert advice in err
@@ -216,16 +232,45 @@ def test_train_json_is_one_line(capsys, calls, tmp_path):
     assert [part["sim_params"]["length"] for part in facts["physics"]] == [0.5, 1.0, 1.5]
 
 
-def test_evaluate_passes_groups_and_episodes(capsys, calls):
-    words = ("evaluate", "there", "--group", "unseen", "train", "--episodes", "5", "--json")
+def test_evaluate_passes_groups_and_episodes(capsys, calls, trained):
+    words = ("evaluate", trained, "--group", "unseen", "train", "--episodes", "5", "--json")
     code, out, _ = run(capsys, *words)
     assert code == 0
-    assert json.loads(out)["run_dir"] == "there"
+    assert json.loads(out)["run_dir"] == trained
     assert calls[0]["groups"] == ("unseen", "train")
     assert calls[0]["num_episodes"] == 5
-    run(capsys, "evaluate", "there")
+    run(capsys, "evaluate", trained)
     assert calls[1]["groups"] is None
     assert calls[1]["num_episodes"] is None
+    assert calls[1]["settings"] == {}
+
+
+def test_evaluate_passes_the_settings_that_differ_from_the_runs(capsys, calls, trained):
+    words = "--planner.num-candidates 50 --planner.horizon 20 --evaluation.seed 7 --json"
+    code, out, _ = run(capsys, "evaluate", trained, *words.split())
+    assert code == 0
+    assert calls[0]["settings"] == {"planner.num_candidates": 50, "evaluation.seed": 7}
+    facts = json.loads(out)
+    assert facts["settings"] == calls[0]["settings"]
+    assert facts["planning"] == {
+        "evaluations_per_step": 300.0,
+        "flop_per_step": 2.5e9,
+        "seconds_per_step": 0.0125,
+    }
+
+
+def test_evaluate_prints_what_planning_took(capsys, calls, trained):
+    code, out, _ = run(capsys, "evaluate", trained)
+    assert code == 0
+    assert "Planning took 300 candidates, 2.5 GFLOP, 12.5 ms per step." in out
+
+
+def test_help_of_evaluate_shows_the_runs_settings(capsys, trained):
+    code, out, err = run(capsys, "evaluate", trained, "--help")
+    assert (code, err) == (0, "")
+    text = " ".join(out.replace("│", " ").split())
+    assert "--planner.horizon INT Imagined steps. (default: 20)" in text
+    assert run(capsys, "evaluate", "--help")[0] == 0
 
 
 @pytest.mark.parametrize(

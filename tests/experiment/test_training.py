@@ -133,6 +133,39 @@ def test_episodes_that_end_early_are_learned_from(tmp_path):
     assert run.metrics()[-1]["fitting"]["transitions"] == sum(lengths)
 
 
+@pytest.mark.parametrize(
+    ("settings", "evaluations"),
+    [
+        ({}, 2 * 16),
+        ({"planner.num_candidates": 8}, 2 * 8),
+        ({"planner.optimizer": "icem"}, 16 + 12 + 2 * 1 + 1),
+        ({"planner.optimizer": "mppi", "planner.num_iterations": 3}, 3 * 16),
+        ({"planner.settle_tolerance": 10.0, "planner.num_iterations": 9}, 16),
+    ],
+)
+def test_a_run_can_be_tested_with_another_planner(settings, evaluations, reference):
+    before = contents(reference)
+    found = headway.evaluate(reference, groups=["low"], num_episodes=3, settings=settings)
+    assert [row.group for row in found] == ["low"] * 3
+    assert len(found) == 3
+    assert found.cost.evaluations_per_step == evaluations
+    rows_per_step = evaluations * 2 * 4  # particles, horizon
+    assert found.cost.flop_per_step == rows_per_step * 2 * (4 * 16 + 16 * 16 + 16 * 6)
+    assert 0 < found.cost.seconds_per_step < 60
+    assert contents(reference) == before
+
+
+def test_what_training_has_fixed_cannot_be_changed_by_a_test(reference):
+    with pytest.raises(
+        headway.ConfigError, match=r"model\.num_heads is fixed by training, allowed:"
+    ):
+        headway.evaluate(reference, settings={"model.num_heads": 2})
+    with pytest.raises(headway.ConfigError, match=r"Did you mean 'planner\.horizon'"):
+        headway.evaluate(reference, settings={"planer.horizon": 2})
+    with pytest.raises(headway.ConfigError, match=r"num_elites is 4, allowed: at most num_cand"):
+        headway.evaluate(reference, settings={"planner.num_candidates": 3})
+
+
 def test_controller_stays_in_bounds_and_names_its_heads(reference):
     controller = headway.load(reference)
     assert controller.heads is None

@@ -54,6 +54,9 @@ def test_actions_are_bounded_finite_and_of_the_tasks_shape():
         assert decision.heads.shape == (2, 2)
         assert np.abs(np.asarray(decision.action)).max() <= 1.0
         np.testing.assert_array_equal(decision.failures, 0)
+        np.testing.assert_array_equal(
+            decision.evaluations, TINY.num_candidates * TINY.num_iterations
+        )
 
 
 def test_heads_and_actions_follow_each_environments_own_physics_after_one_step():
@@ -90,6 +93,21 @@ def test_history_of_a_real_episode_equals_that_of_its_trajectory(selection_lengt
         want = episodes.history(jnp.arange(2), jnp.full(2, step), agent.history_length)
         np.testing.assert_array_equal(got.obs_diff, want.obs_diff)
         np.testing.assert_array_equal(got.action, want.action)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"warm_variance": True}, {"optimizer": "icem", "num_iterations": 2}, {"optimizer": "mppi"}],
+    ids=str,
+)
+def test_act_is_traced_once_whatever_the_optimizer_remembers(settings, monkeypatch):
+    traces = []
+    original = agent_module.encode
+    monkeypatch.setattr(agent_module, "encode", lambda *x: traces.append(1) or original(*x))
+    agent = make_agent(initial_std=0.4321, **settings)
+    state, _, _ = play(agent, [1.0, -1.0], 2)
+    play(agent, [1.0, -1.0], 2, state=reset_where(state, start(agent), jnp.asarray([True, False])))
+    assert len(traces) == 1
 
 
 def test_act_is_traced_once_over_episodes_steps_and_new_weights(monkeypatch):
@@ -131,17 +149,17 @@ def test_an_environment_without_finite_returns_keeps_its_guess_and_is_counted_al
     _, healthy = agent.act(state, seen[-1])
     after, decision = agent.act(state, np.stack([[np.nan, np.nan], seen[-1][1]]))
     np.testing.assert_array_equal(decision.failures, [TINY.num_iterations, 0])
-    np.testing.assert_array_equal(decision.action[0], state.guess[0, 0])
-    np.testing.assert_array_equal(after.guess[0, :-1], state.guess[0, 1:])
+    np.testing.assert_array_equal(decision.action[0], state.search.guess[0, 0])
+    np.testing.assert_array_equal(after.search.guess[0, :-1], state.search.guess[0, 1:])
     np.testing.assert_array_equal(decision.action[1], healthy.action[1])
 
 
 def test_next_guess_is_the_plan_shifted_by_one_and_ends_in_zero():
     agent = make_agent(optimizer="random-shooting")
     state, decision = agent.act(start(agent), jnp.asarray([[0.5, 0.5], [0.1, -0.4]]))
-    np.testing.assert_array_equal(state.guess[:, -1], 0.0)
-    assert np.asarray(state.guess[:, :-1]).all()
-    assert (state.guess[:, 0] != decision.action).any()
+    np.testing.assert_array_equal(state.search.guess[:, -1], 0.0)
+    assert np.asarray(state.search.guess[:, :-1]).all()
+    assert (state.search.guess[:, 0] != decision.action).any()
 
 
 def test_random_selection_ignores_the_data_and_draws_anew_at_every_step():
@@ -184,15 +202,24 @@ def test_a_constant_observation_dimension_plans_without_failures():
         np.testing.assert_array_equal(decision.failures, 0)
 
 
-def test_reset_forgets_the_named_environments_only():
-    agent = make_agent()
+def test_an_agent_that_settles_early_says_how_little_it_evaluated():
+    agent = make_agent(settle_tolerance=0.25, num_iterations=20)
+    _, _, decisions = play(agent, [1.0, -1.0], 3)
+    spent = np.asarray([decision.evaluations for decision in decisions])
+    assert (spent % TINY.num_candidates == 0).all()
+    assert (spent < 20 * TINY.num_candidates).all()
+
+
+@pytest.mark.parametrize(("settings", "num_leaves"), [({}, 8), ({"warm_variance": True}, 9)])
+def test_reset_forgets_the_named_environments_only(settings, num_leaves):
+    agent = make_agent(**settings)
     fresh = start(agent, seed=5)
     state, seen, _ = play(agent, [1.0, -1.0], 3)
     reset = reset_where(state, fresh, jnp.asarray([False, True]))
     parts, before, empty = (
         jax.tree.leaves(part._replace(key=None)) for part in (reset, state, fresh)
     )
-    assert len(parts) == 8
+    assert len(parts) == num_leaves
     for got, old, new in zip(parts, before, empty, strict=True):
         np.testing.assert_array_equal(got[0], old[0])
         np.testing.assert_array_equal(got[1], new[1])

@@ -43,7 +43,7 @@ assert len(jax.devices()) == int(sys.argv[1])
 agent = test_devices.make_agent(**json.loads(sys.argv[2]))
 print(json.dumps(test_devices.actions(agent).tolist()))
 state, _ = agent.act(agent.init(1, key=jax.random.key(0)), [[0.0, 0.0]])
-print(len(state.guess.sharding.device_set))
+print(len(state.search.guess.sharding.device_set))
 """
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import tyro
 
@@ -64,6 +64,27 @@ SECTIONS = {
 }
 
 
+WithSettings = TypeVar("WithSettings", bound="Train | Evaluate")
+
+
+def with_settings(arguments: WithSettings, config: Config) -> WithSettings:
+    """The same arguments with the settings of a configuration."""
+    sections = {name: cls for name, cls in SECTIONS.items() if hasattr(arguments, name)}
+    values = {name: dataclasses.asdict(getattr(config, name)) for name in sections}
+    return dataclasses.replace(arguments, **{n: cls(**values[n]) for n, cls in sections.items()})
+
+
+def changed_settings(arguments: WithSettings, default: WithSettings) -> dict[str, object]:
+    """The settings that differ from some defaults, by dotted name."""
+    changed = {}
+    for section in SECTIONS:
+        given, before = getattr(arguments, section, None), getattr(default, section, None)
+        for name, value in vars(given).items() if given else ():
+            if value != getattr(before, name):
+                changed[f"{section}.{name}"] = value
+    return changed
+
+
 @dataclasses.dataclass(frozen=True)
 class Train:
     """Train a controller on an environment whose physics vary; resume if it was begun before.
@@ -97,41 +118,34 @@ class Train:
 
     def with_defaults(self, config: Config) -> "Train":
         """The same arguments with the names and settings of a configuration."""
-        return dataclasses.replace(
-            self,
-            method=config.method,
-            preset=config.preset,
-            **{
-                section: cls(**dataclasses.asdict(getattr(config, section)))
-                for section, cls in SECTIONS.items()
-            },
-        )
-
-    def settings(self, default: "Train") -> dict[str, object]:
-        """The settings that differ from some defaults, by dotted name."""
-        return {
-            f"{section}.{field.name}": getattr(getattr(self, section), field.name)
-            for section, cls in SECTIONS.items()
-            for field in dataclasses.fields(cls)
-            if getattr(getattr(self, section), field.name)
-            != getattr(getattr(default, section), field.name)
-        }
+        named = dataclasses.replace(self, method=config.method, preset=config.preset)
+        return with_settings(named, config)
 
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate:
-    """Test a trained run on training and unseen physics; nothing in its directory changes."""
+    """Test a trained run on training and unseen physics; nothing in its directory changes.
+
+    It can be tested with another planner than it was trained with. The defaults shown are those
+    of the run named before --help.
+    """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """The run directory."""
     group: Annotated[tuple[str, ...], _unset("all of them")] = ()
     """Groups of physics: `train` or unseen groups."""
     episodes: Annotated[int | None, _unset("as in the run's own tests")] = None
-    """Episodes per group."""
+    """Episodes per group; the same as --evaluation.num-episodes."""
     json: Flag = False
     """Print one JSON line on stdout instead of tables."""
     quiet: Flag = False
     """Show no progress."""
+    planner: PlannerSettings = dataclasses.field(default_factory=PlannerSettings)
+    evaluation: EvaluationSettings = dataclasses.field(default_factory=EvaluationSettings)
+
+    def with_defaults(self, config: Config) -> "Evaluate":
+        """The same arguments with the settings of a run."""
+        return with_settings(self, config)
 
 
 @dataclasses.dataclass(frozen=True)

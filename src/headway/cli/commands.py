@@ -1,5 +1,6 @@
 """One function per command: parse, call the library, print."""
 
+import dataclasses
 import json
 import shlex
 import sys
@@ -9,11 +10,20 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from headway.cli.arguments import Evaluate, List, PlotDynamics, Train
+from headway.cli.arguments import (
+    Evaluate,
+    List,
+    PlotDynamics,
+    Train,
+    WithSettings,
+    changed_settings,
+)
 from headway.cli.usage import UsageError, parse, wants_help
+from headway.config import Config
 from headway.errors import ConfigError, unknown_name
 
 if TYPE_CHECKING:
+    from headway.experiment.evaluation import PlanningCost
     from headway.experiment.runs import EpisodeRow
     from headway.tasks.catalog import EnvSpec
 
@@ -65,19 +75,23 @@ def train(words: Sequence[str]) -> int:
 
 def evaluate(words: Sequence[str]) -> int:
     """`headway evaluate`."""
-    arguments = parse(Evaluate, Evaluate(run=tyro.MISSING), words, "headway evaluate")
+    arguments, settings = parse_evaluate(words)
     from headway import api
     from headway.experiment.progress import make_progress
 
-    rows = api.evaluate(
+    found = api.evaluate(
         arguments.run,
         groups=arguments.group or None,
         num_episodes=arguments.episodes,
+        settings=settings,
         progress=make_progress(arguments.quiet),
     )
     if arguments.json:
-        return _print_json({"run_dir": str(arguments.run), **_results(rows)})
-    _print_evaluation(rows, f"{arguments.run}")
+        cost = dataclasses.asdict(found.cost)
+        facts = {"run_dir": str(arguments.run), "settings": settings, "planning": cost}
+        return _print_json({**facts, **_results(found)})
+    _print_evaluation(found, f"{arguments.run}")
+    _print_cost(found.cost)
     return 0
 
 
@@ -121,34 +135,71 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
 
 
 def parse_train(words: Sequence[str]) -> tuple[Train, dict[str, Any]]:
-    """Parse in two steps, because the defaults depend on environment, method and preset.
+    """Parse `headway train`, whose defaults depend on environment, method and preset.
 
     Returns:
         The arguments, and every setting that differs from the preset's and method's.
     """
-    prog = "headway train"
-    plain = Train(env=tyro.MISSING)
-    asked = [word for word in words if word not in ("-h", "--help")]
-    try:
-        first = parse(Train, plain, asked, prog)
-    except UsageError:
-        if wants_help(words):
-            parse(Train, plain, ["--help"], prog)
-        raise
-    from headway.experiment.methods import make_config
 
-    config = make_config(first.env, method=first.method, preset=first.preset)
-    default = plain.with_defaults(config)
-    if wants_help(words):
-        parse(Train, default, ["--help"], prog)
-    arguments = parse(Train, default, words, prog)
-    settings = arguments.settings(default)
+    def asked(first: Train) -> Config:
+        from headway.experiment.methods import make_config
+
+        return make_config(first.env, method=first.method, preset=first.preset)
+
+    plain = Train(env=tyro.MISSING)
+    arguments, config, settings = _parse_twice(plain, asked, words, "headway train")
     if arguments.env_options:
         chosen = _env_options(arguments.env, arguments.env_options)
         settings["env_options"] = {**config.env_options, **chosen}
     if arguments.sim_params is not None:
         settings["sim_params"] = _read_sim_params(arguments.sim_params)
     return arguments, settings
+
+
+def parse_evaluate(words: Sequence[str]) -> tuple[Evaluate, dict[str, Any]]:
+    """Parse `headway evaluate`, whose defaults are the run's.
+
+    Returns:
+        The arguments, and every setting that differs from the run's.
+    """
+
+    def trained(first: Evaluate) -> Config:
+        from headway.experiment.runs import RunDir
+
+        return RunDir(first.run).config()
+
+    plain = Evaluate(run=tyro.MISSING)
+    arguments, _, settings = _parse_twice(plain, trained, words, "headway evaluate")
+    return arguments, settings
+
+
+def _parse_twice(
+    plain: WithSettings, read: Callable[[WithSettings], Config], words: Sequence[str], prog: str
+) -> tuple[WithSettings, Config, dict[str, Any]]:
+    """Parse once to learn whose settings are the defaults, and once more with these.
+
+    Args:
+        plain: The command's arguments as they are before anything is known.
+        read: Finds the configuration that the arguments of the first step name.
+        words: What was typed after the command's name.
+        prog: The command's name.
+
+    Returns:
+        The arguments, the configuration, and every setting that differs from it.
+    """
+    command = type(plain)
+    try:
+        first = parse(command, plain, [w for w in words if not wants_help([w])], prog)
+    except UsageError:
+        if wants_help(words):
+            parse(command, plain, ["--help"], prog)
+        raise
+    config = read(first)
+    default = plain.with_defaults(config)
+    if wants_help(words):
+        parse(command, default, ["--help"], prog)
+    arguments = parse(command, default, words, prog)
+    return arguments, config, changed_settings(arguments, default)
 
 
 def _env_options(env: str, words: Sequence[str]) -> dict[str, bool]:
@@ -189,6 +240,12 @@ def _print_evaluation(rows: "Sequence[EpisodeRow]", title: str) -> None:
     from headway.report.tables import evaluation
 
     _print_tables(evaluation(rows, title))
+
+
+def _print_cost(cost: "PlanningCost") -> None:
+    time = "" if cost.seconds_per_step is None else f", {1e3 * cost.seconds_per_step:.3g} ms"
+    candidates = f"{cost.evaluations_per_step:,.0f} candidates"
+    print(f"Planning took {candidates}, {cost.flop_per_step / 1e9:.3g} GFLOP{time} per step.")
 
 
 def _print_tables(*tables: Any) -> None:

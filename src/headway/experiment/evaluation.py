@@ -1,5 +1,6 @@
 """Testing a controller on training and unseen physics (fact sheet D.2)."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 
 import jax
@@ -7,12 +8,39 @@ from jaxtyping import PRNGKeyArray
 
 from headway.config import Config
 from headway.data import Trajectory
-from headway.experiment.rollouts import Arena, Episode, agent_policy, run_episodes
+from headway.experiment.rollouts import Arena, Episode, PlannerUse, agent_policy, run_episodes
 from headway.experiment.runs import EpisodeRow
 from headway.planning.agent import Agent
+from headway.planning.flop import plan_flop
 from headway.sim_params import SimParamSets
+from headway.tasks.base import Task
 
 GROUP_SEEDS = 1000  # seeds reserved for each group, so that groups never share an episode
+
+
+@dataclasses.dataclass(frozen=True)
+class PlanningCost:
+    """What planning one step of one environment took, on average over some episodes."""
+
+    evaluations_per_step: float
+    """Candidates that were scored; fewer than the settings allow where searches end early."""
+    flop_per_step: float
+    """Floating-point operations of the matrix products of their rollouts."""
+    seconds_per_step: float | None
+    """Time to choose the actions of a batch, over its size; None if nothing was timed.
+
+    The first step of each batch is left out, because it may compile.
+    """
+
+    @classmethod
+    def of(cls, use: PlannerUse, config: Config, task: Task) -> "PlanningCost":
+        """The averages of what was counted."""
+        evaluations = use.evaluations / use.steps
+        return cls(
+            evaluations,
+            plan_flop(config.model, config.planner, task, evaluations),
+            use.seconds / use.timed_steps if use.timed_steps else None,
+        )
 
 
 def group_episodes(
@@ -42,7 +70,7 @@ def evaluate_agent(
     *,
     key: PRNGKeyArray,
     on_step: Callable[[int], None] = lambda steps: None,
-) -> tuple[dict[str, list[Trajectory]], int]:
+) -> tuple[dict[str, list[Trajectory]], PlannerUse]:
     """Run the test episodes of some groups, as many side by side as the batch holds.
 
     Args:
@@ -54,8 +82,8 @@ def evaluate_agent(
         on_step: Called after each step with the number of environments that stepped.
 
     Returns:
-        The trajectories of each group, in the order of their episodes, and the number of
-        planner iterations that found nothing finite.
+        The trajectories of each group, in the order of their episodes, and what planning them
+        took.
     """
     evaluation = config.evaluation
     episodes = [
@@ -66,15 +94,15 @@ def evaluate_agent(
         )
     ]
     found: dict[str, list[Trajectory]] = {group: [] for group in groups}
-    size, failures = arena.vector.num_envs, 0
+    size, use = arena.vector.num_envs, PlannerUse()
     for chunk, start in enumerate(range(0, len(episodes), size)):
         batch = episodes[start : start + size]
         policy = agent_policy(agent, size, key=jax.random.fold_in(key, chunk))
         rollout = run_episodes(arena, [episode for _, episode in batch], policy, on_step)
-        failures += rollout.planner_failures
+        use += rollout.use
         for (group, _), trajectory in zip(batch, rollout.trajectories, strict=True):
             found[group].append(trajectory)
-    return found, failures
+    return found, use
 
 
 def episode_rows(

@@ -10,7 +10,7 @@ from typing import Any
 
 from headway.config import Config
 from headway.errors import ConfigError, unknown_name
-from headway.settings import override
+from headway.settings import override, setting_names
 from headway.tasks.catalog import EnvSpec, env_spec
 
 Settings = Mapping[str, Any]
@@ -147,6 +147,8 @@ _PRESETS = (
     ),
 )
 
+TESTED_SECTIONS = ("planner", "evaluation")  # what a trained run can be tested with
+
 METHODS: dict[str, Method] = {method.name: method for method in _METHODS}
 PRESETS: dict[str, Preset] = {preset.name: preset for preset in _PRESETS}
 
@@ -184,6 +186,26 @@ def make_config(
     config = override(start, {**named, "seed": seed, **(settings or {})})
     check_options(config)
     return config
+
+
+def tested_config(config: Config, settings: Settings) -> Config:
+    """The settings of a trained run with some of its tests' replaced.
+
+    Args:
+        config: The settings that the run was trained with.
+        settings: Changes by dotted name, of the sections in `TESTED_SECTIONS` only.
+
+    Raises:
+        ConfigError: A setting is unknown, of the wrong type or out of range, or one that
+            training has fixed.
+    """
+    for name in settings:
+        if name in setting_names(config) and name.partition(".")[0] not in TESTED_SECTIONS:
+            raise ConfigError(
+                f"{name} is fixed by training, allowed: settings of"
+                f" {' and '.join(TESTED_SECTIONS)}; train another run to change it."
+            )
+    return override(config, settings)
 
 
 def check_options(config: Config) -> None:

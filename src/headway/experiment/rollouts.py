@@ -4,14 +4,15 @@ One vector environment and one compiled agent serve collection and evaluation al
 """
 
 import dataclasses
+import time
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from headway import envs
 from headway.config import Config
@@ -72,21 +73,30 @@ class Arena:
         return cls(spec, task, vector, sim_params, length)
 
 
+class Choice(NamedTuple):
+    """What a policy chose for every environment of a batch."""
+
+    action: Float[np.ndarray, "env action"]
+    """The actions to take, in [-1, 1]."""
+    failures: Int[np.ndarray, " env"]
+    """Planner iterations that found nothing finite."""
+    evaluations: Int[np.ndarray, " env"]
+    """Candidates that the planner scored."""
+
+
 class Policy(Protocol):
     """Chooses scaled actions for a batch of environments, step by step."""
 
-    def __call__(
-        self, obs: Float[np.ndarray, "env obs"]
-    ) -> tuple[Float[np.ndarray, "env action"], Int[np.ndarray, " env"]]:
-        """Return actions in [-1, 1], and how many planner iterations found nothing finite."""
+    def __call__(self, obs: Float[np.ndarray, "env obs"]) -> Choice:
+        """Choose for every environment."""
         ...
 
 
 def random_policy(arena: Arena, rng: np.random.Generator) -> Policy:
     """Uniform random actions, as in the first iteration."""
     shape = (arena.vector.num_envs, arena.task.action_size)
-    no_failures = np.zeros(arena.vector.num_envs, int)
-    return lambda obs: (rng.uniform(-1.0, 1.0, shape).astype(np.float32), no_failures)
+    none = np.zeros(arena.vector.num_envs, int)
+    return lambda obs: Choice(rng.uniform(-1.0, 1.0, shape).astype(np.float32), none, none)
 
 
 def agent_policy(agent: Agent, num_envs: int, *, key: PRNGKeyArray) -> Policy:
@@ -96,9 +106,35 @@ def agent_policy(agent: Agent, num_envs: int, *, key: PRNGKeyArray) -> Policy:
     def act(obs):
         nonlocal state
         state, decision = agent.act(state, jnp.asarray(obs, jnp.float32))
-        return jax.device_get((decision.action, decision.failures))
+        return Choice(*jax.device_get((decision.action, decision.failures, decision.evaluations)))
 
     return act
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannerUse:
+    """What planning took over some episodes; sums with `+`."""
+
+    steps: int = 0
+    """Environment steps that were planned."""
+    failures: int = 0
+    """Planner iterations that found nothing finite."""
+    evaluations: int = 0
+    """Candidates that were scored."""
+    timed_steps: int = 0
+    """Environment steps that were timed, those of surplus environments included."""
+    seconds: float = 0.0
+    """What the timed steps took."""
+
+    @classmethod
+    def of_step(cls, choice: Choice, running: Bool[np.ndarray, " env"]) -> "PlannerUse":
+        """One step, in which only the first `len(running)` environments matter."""
+        failures, evaluations = (int(x[: len(running)][running].sum()) for x in choice[1:])
+        return cls(int(running.sum()), failures, evaluations)
+
+    def __add__(self, other: "PlannerUse") -> "PlannerUse":
+        mine, others = dataclasses.astuple(self), dataclasses.astuple(other)
+        return PlannerUse(*(a + b for a, b in zip(mine, others, strict=True)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,7 +142,7 @@ class Rollout:
     """Finished episodes, in the order they were asked for."""
 
     trajectories: list[Trajectory]
-    planner_failures: int
+    use: PlannerUse
 
 
 def run_episodes(
@@ -136,14 +172,18 @@ def run_episodes(
     length = np.zeros(len(filled), np.int64)
     terminated = np.zeros(len(filled), bool)
     running = np.ones(len(filled), bool)
-    failures = 0
+    use = PlannerUse()
     for step in range(arena.episode_length):
-        action, failed = policy(obs)
-        failures += int(failed[:wanted][running[:wanted]].sum())
-        obs, reward, ends, cut, _ = arena.vector.step(env_action(arena.task, action))
+        started = time.perf_counter()
+        choice = policy(obs)
+        seconds = time.perf_counter() - started
+        use += PlannerUse.of_step(choice, running[:wanted])
+        if step:  # the first one may compile
+            use += PlannerUse(timed_steps=len(filled), seconds=seconds)
+        obs, reward, ends, cut, _ = arena.vector.step(env_action(arena.task, choice.action))
         observations.append(check(arena, obs, filled, "obs", step + 1))
         rewards.append(check(arena, reward, filled, "reward", step + 1))
-        actions.append(action)
+        actions.append(choice.action)
         length += running
         terminated |= running & ends
         running &= ~(ends | cut)
@@ -155,7 +195,7 @@ def run_episodes(
         _cut(table, row, int(length[row]), filled[row], bool(terminated[row]))
         for row in range(wanted)
     ]
-    return Rollout(trajectories, failures)
+    return Rollout(trajectories, use)
 
 
 def check(

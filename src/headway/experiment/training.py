@@ -18,7 +18,14 @@ from headway.experiment.diagnostics import head_shares, prediction_error
 from headway.experiment.evaluation import episode_rows, evaluate_agent
 from headway.experiment.methods import check_options
 from headway.experiment.progress import Progress
-from headway.experiment.rollouts import Arena, Episode, agent_policy, random_policy, run_episodes
+from headway.experiment.rollouts import (
+    Arena,
+    Episode,
+    PlannerUse,
+    agent_policy,
+    random_policy,
+    run_episodes,
+)
 from headway.experiment.runs import RunDir
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import EpochStats, FitData, FitSetup, FitState, fit_epoch, make_data
@@ -117,7 +124,7 @@ class Trainer:
         clock.append(time.perf_counter())
         fitting = self.fit(iteration, keys.fit)
         clock.append(time.perf_counter())
-        tested, test_failures = self.evaluate(iteration, keys.evaluate)
+        tested, test_use = self.evaluate(iteration, keys.evaluate)
         clock.append(time.perf_counter())
         metrics = {
             "iteration": iteration,
@@ -125,7 +132,7 @@ class Trainer:
             "collection": {**_summary(collected), "planner_failures": failures},
             "fitting": fitting,
             "evaluation": {group: _summary(found) for group, found in tested.items()},
-            "test_planner_failures": test_failures,
+            "test_planner_failures": test_use.failures,
             "seconds": {
                 name: round(clock[i + 1] - clock[i], 3)
                 for i, name in enumerate(("collect", "fit", "evaluate"))
@@ -149,7 +156,7 @@ class Trainer:
         rollout = run_episodes(arena, episodes, policy, self.progress.advance)
         for trajectory in rollout.trajectories:
             self.buffer.add(trajectory)
-        return rollout.trajectories, rollout.planner_failures
+        return rollout.trajectories, rollout.use.failures
 
     def episodes(self) -> Episodes:
         """Everything collected, in arrays that have the same shape all through the run."""
@@ -204,11 +211,11 @@ class Trainer:
 
     def evaluate(
         self, iteration: int, key: PRNGKeyArray
-    ) -> tuple[dict[str, list[Trajectory]], int]:
+    ) -> tuple[dict[str, list[Trajectory]], PlannerUse]:
         """Test on the unseen groups, and on the training physics when the settings say so."""
         groups = self.groups(iteration)
         if not groups:
-            return {}, 0
+            return {}, PlannerUse()
         self.phase(iteration, "evaluate")
         advance = self.progress.advance
         return evaluate_agent(self.agent, self.arena, self.config, groups, key=key, on_step=advance)
@@ -303,13 +310,17 @@ def load_learned(run: RunDir, config: Config) -> Learned:
     return storage.load_tree(run.checkpoint(finished - 1), template)
 
 
-def load_agent(run: RunDir) -> Agent:
+def load_agent(run: RunDir, config: Config | None = None) -> Agent:
     """The agent of a run, as trained so far.
+
+    Args:
+        run: The run.
+        config: Its settings, with those of the planner perhaps changed; as it is by default.
 
     Raises:
         RunError: There is no run, it has no finished iteration, or it is damaged.
     """
-    config = run.config()
+    config = config or run.config()
     return make_agent(config, load_task(config), load_learned(run, config))
 
 

@@ -13,7 +13,7 @@ from headway.models.compilation import jit_networks
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.planning.heads import RecentTransitions, head_errors, select_heads
 from headway.planning.imagination import ImaginedDynamics
-from headway.planning.optimizers import make_optimizer
+from headway.planning.optimizers import SearchState, make_optimizer, where_env
 from headway.planning.returns import RolloutSettings, candidate_returns
 from headway.tasks.base import Task
 
@@ -25,7 +25,7 @@ class AgentState(NamedTuple):
     obs: Float[Array, "env obs"]
     action: Float[Array, "env action"]
     acted: Bool[Array, " env"]
-    guess: Float[Array, "env horizon action"]
+    search: SearchState
     key: PRNGKeyArray
 
 
@@ -38,6 +38,8 @@ class Decision(NamedTuple):
     """The head each member plans with; with `average`, the one that would be adaptive."""
     failures: Int[Array, " env"]
     """Planner iterations without any finite return."""
+    evaluations: Int[Array, " env"]
+    """Candidates whose return was imagined, each with `num_particles` rollouts."""
 
 
 class Agent(eqx.Module):
@@ -56,13 +58,13 @@ class Agent(eqx.Module):
     def init(self, num_envs: int, *, key: PRNGKeyArray) -> AgentState:
         """Remember nothing yet of `num_envs` environments."""
         slots = max(self.history_length, self.planner.selection_length)
-        action = jnp.zeros((num_envs, self.task.action_size))
+        action_size = self.task.action_size
         return AgentState(
             RecentTransitions.empty(num_envs, slots, self.task),
             jnp.zeros((num_envs, self.task.obs_size)),
-            action,
+            jnp.zeros((num_envs, action_size)),
             jnp.zeros(num_envs, bool),
-            jnp.zeros((num_envs, self.planner.horizon, self.task.action_size)),
+            make_optimizer(self.planner).init(num_envs, self.planner.horizon, action_size),
             key,
         )
 
@@ -97,13 +99,13 @@ def _act(
     def score(candidates, key):
         return candidate_returns(dynamics, agent.task, obs, candidates, settings=settings, key=key)
 
-    plan = make_optimizer(agent.planner).optimize(score, state.guess, key=plan_key)
-    # 5. Take the first action; the rest, shifted by one step, is the next guess.
+    optimizer = make_optimizer(agent.planner)
+    plan = optimizer.optimize(score, state.search, key=plan_key)
+    # 5. Take the first action; where the search ended, one step later, is the next start.
     action = plan.actions[:, 0]
-    guess = jnp.concatenate([plan.actions[:, 1:], jnp.zeros_like(plan.actions[:, :1])], axis=1)
     acted = jnp.ones_like(state.acted)
-    state = AgentState(recent, obs, action, acted, guess, key)
-    return state, Decision(action, heads, plan.failures)
+    state = AgentState(recent, obs, action, acted, optimizer.shift(plan.state), key)
+    return state, Decision(action, heads, plan.failures, plan.evaluations)
 
 
 _act_float32 = jit_networks(_act)
@@ -150,9 +152,5 @@ def planning_heads(
 
 def reset_where(state: AgentState, fresh: AgentState, done: Bool[Array, " env"]) -> AgentState:
     """Forget everything about the environments where an episode begins anew."""
-
-    def pick(old, new):
-        return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-
-    kept = jax.tree.map(pick, state._replace(key=None), fresh._replace(key=None))
+    kept = where_env(done, fresh._replace(key=None), state._replace(key=None))
     return kept._replace(key=state.key)

@@ -1,0 +1,145 @@
+"""The cross-entropy method, as the paper plans with it."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray
+
+from headway.planning.optimizers.base import (
+    Optimizer,
+    Plan,
+    Score,
+    SearchState,
+    shift_steps,
+    where_env,
+)
+from headway.planning.optimizers.ranking import best_candidates, moments, rank_non_finite_last
+
+
+class CEM(Optimizer):
+    """Cross-entropy method with clipped variance and smoothing (PETS; fact sheet C.1).
+
+    It plans the final mean, not the best candidate. The expected return is the mean over the
+    finite elites of the last iteration.
+
+    With `warm_variance` the variance of the last plan is kept like its mean, instead of
+    starting from `initial_std` at every step. With a `settle_tolerance` an environment is
+    settled once its mean moves by less in one iteration (root mean square over the plan); it
+    keeps its plan, and the search ends when all environments are settled.
+    """
+
+    num_candidates: int = 200
+    num_elites: int = 50
+    num_iterations: int = 5
+    smoothing: float = 0.1
+    initial_std: float = 0.5
+    warm_variance: bool = False
+    warm_min_std: float = 0.1
+    settle_tolerance: float = 0.0
+
+    @property
+    def max_evaluations(self) -> int:
+        """See `Optimizer.max_evaluations`."""
+        return self.num_candidates * self.num_iterations
+
+    def init(self, num_envs: int, horizon: int, action_size: int) -> SearchState:
+        """See `Optimizer.init`."""
+        state = super().init(num_envs, horizon, action_size)
+        return state._replace(variance=self._initial(state.guess)) if self.warm_variance else state
+
+    def optimize(self, score: Score, state: SearchState, *, key: PRNGKeyArray) -> Plan:
+        """See `Optimizer.optimize`."""
+        keys = jax.random.split(key, self.num_iterations)
+        search = self._start(state)
+        if self.settle_tolerance:
+            search = self._until_settled(score, search, keys)
+        else:
+            search, _ = jax.lax.scan(
+                lambda search, key: (self._iterate(score, search, key), None), search, keys
+            )
+        actions = jnp.clip(search.mean, -1.0, 1.0)
+        variance = search.var if self.warm_variance else None
+        ended = SearchState(actions, variance)
+        return Plan(actions, search.expected, search.failures, search.evaluations, ended)
+
+    def shift(self, state: SearchState) -> SearchState:
+        """See `Optimizer.shift`; the new last step starts from `initial_std`."""
+        shifted = super().shift(state)
+        if state.variance is None:
+            return shifted
+        return shifted._replace(variance=shift_steps(state.variance, self.initial_std**2))
+
+    def _initial(
+        self, guess: Float[Array, "env horizon action"]
+    ) -> Float[Array, "env horizon action"]:
+        return jnp.full_like(guess, self.initial_std**2)
+
+    def _start(self, state: SearchState) -> "_Search":
+        num_envs = len(state.guess)
+        if state.variance is None:
+            var = self._initial(state.guess)
+        else:
+            var = jnp.maximum(state.variance, self.warm_min_std**2)
+        none = jnp.zeros(num_envs, jnp.int32)
+        return _Search(state.guess, var, jnp.zeros(num_envs), none, none, jnp.zeros(num_envs, bool))
+
+    def _until_settled(
+        self, score: Score, search: "_Search", keys: Key[Array, " iteration"]
+    ) -> "_Search":
+        """Iterate while an environment is not settled; the settled ones stay as they are."""
+
+        def unsettled(carry):
+            iteration, search = carry
+            return (iteration < self.num_iterations) & ~search.settled.all()
+
+        def iterate(carry):
+            iteration, search = carry
+            found = self._iterate(score, search, keys[iteration])
+            return iteration + 1, where_env(search.settled, search, found)
+
+        return jax.lax.while_loop(unsettled, iterate, (0, search))[1]
+
+    def _iterate(self, score: Score, search: "_Search", key: PRNGKeyArray) -> "_Search":
+        draw_key, score_key = jax.random.split(key)
+        candidates = self._draw(search.mean, search.var, draw_key)
+        returns = rank_non_finite_last(score(candidates, score_key))
+        # The elites: the best candidates, those with a finite return only.
+        elites, elite_returns = best_candidates(candidates, returns, self.num_elites)
+        finite = jnp.isfinite(elite_returns)
+        new_mean, new_var = moments(elites, finite)
+        # Keep a share of the old distribution; keep all of it when nothing was finite.
+        found = finite.any(-1)
+        keep = jnp.where(found[:, None, None], self.smoothing, 1.0)
+        mean = keep * search.mean + (1.0 - keep) * new_mean
+        total = jnp.where(finite, elite_returns, 0.0).sum(-1)
+        moved = jnp.sqrt(jnp.square(mean - search.mean).mean((1, 2)))
+        return _Search(
+            mean=mean,
+            var=keep * search.var + (1.0 - keep) * new_var,
+            expected=jnp.where(found, total / jnp.maximum(finite.sum(-1), 1), -jnp.inf),
+            failures=search.failures + ~found,
+            evaluations=search.evaluations + self.num_candidates,
+            settled=found & (moved < self.settle_tolerance),
+        )
+
+    def _draw(
+        self, mean: Float[Array, "env horizon action"], var: Float[Array, "env horizon action"], key
+    ) -> Float[Array, "env candidate horizon action"]:
+        """Draw from a normal truncated at two deviations, narrowed to stay inside ±1."""
+        room = jnp.minimum(jnp.square((mean + 1) / 2), jnp.square((1 - mean) / 2))
+        std = jnp.sqrt(jnp.minimum(room, var))
+        shape = (mean.shape[0], self.num_candidates, *mean.shape[1:])
+        draws = jax.random.truncated_normal(key, -2.0, 2.0, shape)
+        return mean[:, None] + std[:, None] * draws
+
+
+class _Search(NamedTuple):
+    """A search under way."""
+
+    mean: Float[Array, "env horizon action"]
+    var: Float[Array, "env horizon action"]
+    expected: Float[Array, " env"]
+    failures: Int[Array, " env"]
+    evaluations: Int[Array, " env"]
+    settled: Bool[Array, " env"]

@@ -1,0 +1,73 @@
+"""Model predictive path integral control (MPPI)."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from headway.planning.optimizers.base import Optimizer, Plan, Score, SearchState
+from headway.planning.optimizers.noise import colored_noise
+from headway.planning.optimizers.ranking import rank_non_finite_last
+
+
+class MPPI(Optimizer):
+    """Information-theoretic MPPI, some iterations per step (Williams et al., 2017).
+
+    The plan is the average of all candidates, weighted by exp(return / temperature). The returns
+    are standardised over the candidates of an iteration, so one temperature suits tasks whose
+    rewards differ in scale. The candidates' deviation stays `initial_std`. They are clipped to
+    the bounds, and the cost of control is what the return says: the method's own term for it,
+    which weighs the noise against the mean, is left out, as for a base distribution centred at
+    the mean. The expected return is the weighted mean return of the last iteration.
+    """
+
+    num_candidates: int = 200
+    num_iterations: int = 5
+    initial_std: float = 0.5
+    noise_beta: float = 2.0
+    temperature: float = 0.5
+
+    @property
+    def max_evaluations(self) -> int:
+        """See `Optimizer.max_evaluations`."""
+        return self.num_candidates * self.num_iterations
+
+    def optimize(self, score: Score, state: SearchState, *, key: PRNGKeyArray) -> Plan:
+        """See `Optimizer.optimize`."""
+        num_envs, *sequence_shape = state.guess.shape
+        shape = (num_envs, self.num_candidates, *sequence_shape)
+
+        def iterate(carry, key):
+            mean, failures, _ = carry
+            draw_key, score_key = jax.random.split(key)
+            noise = colored_noise(draw_key, shape, self.noise_beta)
+            candidates = jnp.clip(mean[:, None] + self.initial_std * noise, -1.0, 1.0)
+            returns = rank_non_finite_last(score(candidates, score_key))
+            weights = softmax_weights(returns, self.temperature)
+            found = jnp.isfinite(returns).any(-1)
+            average = (weights[..., None, None] * candidates).sum(1)
+            mean = jnp.where(found[:, None, None], average, mean)
+            expected = (weights * jnp.where(weights > 0, returns, 0.0)).sum(-1)
+            return (mean, failures + ~found, jnp.where(found, expected, -jnp.inf)), None
+
+        carry = state.guess, jnp.zeros(num_envs, jnp.int32), jnp.zeros(num_envs)
+        keys = jax.random.split(key, self.num_iterations)
+        (mean, failures, expected), _ = jax.lax.scan(iterate, carry, keys)
+        actions = jnp.clip(mean, -1.0, 1.0)
+        evaluations = jnp.full(num_envs, self.max_evaluations)
+        return Plan(actions, expected, failures, evaluations, SearchState(actions))
+
+
+def softmax_weights(
+    returns: Float[Array, "env candidate"], temperature: float
+) -> Float[Array, "env candidate"]:
+    """Weights that sum to 1, by the softmax of the standardised returns over a temperature.
+
+    Equal returns weigh the same; a return of -inf weighs nothing, and so do all of them where
+    nothing is finite.
+    """
+    finite = jnp.isfinite(returns)
+    mean = jnp.mean(returns, axis=-1, keepdims=True, where=finite)
+    std = jnp.std(returns, axis=-1, keepdims=True, where=finite)
+    logits = (returns - mean) / jnp.where(std > 0, std, 1.0) / temperature
+    weights = jax.nn.softmax(jnp.where(finite, logits, -jnp.inf), axis=-1)
+    return jnp.where(finite, weights, 0.0)
