@@ -12,10 +12,10 @@ CONSTRAINED_PYTHONS ?= python3.11 python3.12
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow lint bench docs constraints clean
+.PHONY: help demo test test-slow lint bench bench-million docs constraints clean
 
 help: ## List the targets
-	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' Makefile | awk -F'|' '{ printf "make %-12s %s\n", $$1, $$2 }'
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' Makefile | awk -F'|' '{ printf "make %-14s %s\n", $$1, $$2 }'
 
 demo: $(VENV)/main.stamp ## Train and evaluate T-MCL on Pendulum, in minutes
 	@$(BIN)/headway train pendulum --preset quick --seed 0 --run-dir runs/demo
@@ -34,6 +34,9 @@ lint: $(VENV)/test.stamp $(VENV)/lint.stamp ## Check style, types and import rul
 
 bench: $(VENV)/test.stamp $(VENV)/bench.stamp ## Time planning, fitting and environments; wants an idle machine
 	@$(BIN)/python -m pytest benchmarks -o python_files='bench_*.py' -p no:xdist --benchmark-quiet
+
+bench-million: $(VENV)/main.stamp ## Measure memory while fitting a million transitions, in minutes; Linux
+	@$(BIN)/python benchmarks/bench_million.py
 
 docs: $(VENV)/test.stamp ## Check that the links in README and docs lead somewhere (there is no site yet)
 	@$(BIN)/python -m pytest tests/test_package.py -k links

@@ -105,6 +105,9 @@ class FittingConfig:
     """Passes over the data per iteration."""
     batch_size: int = 256
     """Samples per member and update."""
+    block_transitions: int = 200_000
+    """Most transitions, padding counted, that are fitted as one block; larger data are gone
+    through block by block, in bounded memory. The paper's data are one block."""
     learning_rate: float = 1e-3
     """Adam's step size."""
     future_length: int = 5
@@ -128,6 +131,7 @@ class FittingConfig:
     def __post_init__(self):
         problems = _Problems(self)
         problems.at_least(1, "segment_length", "epochs", "batch_size", "future_length")
+        problems.at_least(1, "block_transitions")
         problems.at_least(
             0, "warmup_iterations", "backward_weight", "logvar_bound_weight", "weight_decay"
         )

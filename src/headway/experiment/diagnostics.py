@@ -1,6 +1,7 @@
 """What a trained model has learned: head shares per physics, error by imagined step."""
 
 from collections import defaultdict
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -21,21 +22,27 @@ NUM_STARTS = 256  # imagined rollouts per group in `prediction_error`
 
 
 def head_shares(
-    agent: Agent, setup: FitSetup, trajectories: list[Trajectory], episodes: Episodes
+    agent: Agent, setup: FitSetup, blocks: Iterable[tuple[list[Trajectory], Episodes]]
 ) -> list[dict[str, Any]]:
     """Share of the segments of each physics that each head of each member owns.
+
+    Args:
+        agent: The agent as trained so far.
+        setup: Task and settings of fitting.
+        blocks: Trajectories and the same laid out, a block at a time.
 
     Returns:
         Rows of `assignments.csv`, without the iteration.
     """
-    assignment = eqx.filter_jit(assign_segments)(agent.model, setup, episodes, agent.statistics)
-    heads = np.asarray(assignment.forward)
+    assign = eqx.filter_jit(assign_segments)
     owned = defaultdict(lambda: np.zeros((agent.model.num_members, agent.model.num_heads)))
-    for row, trajectory in enumerate(trajectories):
-        used = -(-len(trajectory) // setup.segment_length)
-        for head in range(agent.model.num_heads):
-            count = (heads[:, row, :used] == head).sum(-1)
-            owned[format_sim_params(trajectory.sim_params)][:, head] += count
+    for trajectories, episodes in blocks:
+        heads = np.asarray(assign(agent.model, setup, episodes, agent.statistics).forward)
+        for row, trajectory in enumerate(trajectories):
+            used = -(-len(trajectory) // setup.segment_length)
+            for head in range(agent.model.num_heads):
+                count = (heads[:, row, :used] == head).sum(-1)
+                owned[format_sim_params(trajectory.sim_params)][:, head] += count
     return [
         {"member": member, "head": head, "sim_params": physics, "share": float(share)}
         for physics, counts in sorted(owned.items())

@@ -185,6 +185,7 @@ def make_config(
     start = Config(env=spec.name, method=method, preset=preset)
     config = override(start, {**named, "seed": seed, **(settings or {})})
     check_options(config)
+    check_block(config)
     return config
 
 
@@ -218,3 +219,17 @@ def check_options(config: Config) -> None:
     for option in config.env_options:
         if option not in spec.options:
             raise ConfigError(str(unknown_name(f"{spec.name} option", option, spec.options)))
+
+
+def check_block(config: Config) -> None:
+    """Refuse blocks that do not hold one whole episode.
+
+    Raises:
+        ConfigError: `fitting.block_transitions` is too small.
+    """
+    length = config.collection.episode_length or env_spec(config.env).episode_length
+    if config.fitting.block_transitions < length:
+        raise ConfigError(
+            f"fitting.block_transitions is {config.fitting.block_transitions}, allowed: at least"
+            f" the {length} steps of an episode; raise it or lower collection.episode_length."
+        )

@@ -201,10 +201,13 @@ class RunDir:
         """Keep what an iteration collected."""
         storage.save_trajectories(self._data(iteration), trajectories)
 
+    def iteration_data(self, iteration: int) -> list[Trajectory]:
+        """The trajectories that an iteration collected, memory-mapped."""
+        return storage.load_trajectories(self._data(iteration))
+
     def load_data(self) -> list[Trajectory]:
-        """All trajectories of the finished iterations."""
-        finished = range(self.finished_iterations)
-        return [t for i in finished for t in storage.load_trajectories(self._data(i))]
+        """All trajectories of the finished iterations, memory-mapped."""
+        return [t for i in range(self.finished_iterations) for t in self.iteration_data(i)]
 
     def _data(self, iteration: int) -> Path:
         return self.path / "data" / f"iteration-{iteration:03d}"

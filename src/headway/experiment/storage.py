@@ -16,6 +16,7 @@ from safetensors import SafetensorError
 
 from headway.data import Trajectory
 from headway.errors import RunError
+from headway.experiment.mapped import map_arrays
 
 Tree = TypeVar("Tree")
 
@@ -150,12 +151,12 @@ def save_trajectories(path: Path, trajectories: Sequence[Trajectory]) -> None:
 
 
 def load_trajectories(path: Path) -> list[Trajectory]:
-    """Read what `save_trajectories` wrote.
+    """Open what `save_trajectories` wrote; the arrays are read-only views of the mapped file.
 
     Raises:
         RunError: A file is missing or damaged.
     """
-    arrays = _read_arrays(path.with_suffix(".safetensors"))
+    arrays = map_arrays(path.with_suffix(".safetensors"))
     facts = read_json(path.with_suffix(".json"))
     try:
         return [

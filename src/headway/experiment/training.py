@@ -1,7 +1,9 @@
 """The training loop: collect, fit, evaluate, save, and again (supplement A.2; fact sheet D)."""
 
 import dataclasses
+import itertools
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,12 +13,13 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from headway.config import Config
-from headway.data import Episodes, ReplayBuffer, Samples, Trajectory
+from headway.data import ReplayBuffer, Trajectory
 from headway.errors import DivergenceError, RunError
 from headway.experiment import storage
+from headway.experiment.blocks import BlockedData, Layout, fit_blocks
 from headway.experiment.diagnostics import head_shares, prediction_error
 from headway.experiment.evaluation import episode_rows, evaluate_agent
-from headway.experiment.methods import check_options
+from headway.experiment.methods import check_block, check_options
 from headway.experiment.progress import Progress
 from headway.experiment.rollouts import (
     Arena,
@@ -28,7 +31,7 @@ from headway.experiment.rollouts import (
 )
 from headway.experiment.runs import RunDir
 from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.models.fitting import EpochStats, FitData, FitSetup, FitState, fit_epoch, make_data
+from headway.models.fitting import EpochStats, FitSetup, FitState
 from headway.planning.agent import Agent
 from headway.tasks.base import Task
 from headway.tasks.catalog import env_spec
@@ -62,6 +65,7 @@ class Trainer:
     config: Config
     run: RunDir
     arena: Arena
+    layout: Layout
     setup: FitSetup
     learned: Learned
     buffer: ReplayBuffer
@@ -72,10 +76,13 @@ class Trainer:
         """Begin a run, or go on with the one in the directory.
 
         Raises:
+            ConfigError: The settings do not fit the environment.
             RunError: The directory holds another run, or a damaged one.
             BadEnvironmentError: The environment does not fit its Task.
         """
+        check_block(config)
         arena = Arena.make(config)
+        layout = Layout.of(config, arena.episode_length)
         run.create_or_resume(config)
         run.check()
         setup = FitSetup(arena.task, config.fitting, config.model.history_length)
@@ -84,7 +91,7 @@ class Trainer:
             buffer.add(trajectory)
         finished = run.finished_iterations
         learned = initial(config, arena.task) if finished == 0 else load_learned(run, config)
-        return cls(config, run, arena, setup, learned, buffer, progress)
+        return cls(config, run, arena, layout, setup, learned, buffer, progress)
 
     @property
     def agent(self) -> Agent:
@@ -138,7 +145,7 @@ class Trainer:
                 for i, name in enumerate(("collect", "fit", "evaluate"))
             },
         }
-        self.save(iteration, collected, tested, metrics, keys.diagnose)
+        self.save(iteration, tested, metrics, keys.diagnose)
         self.progress.iteration_done(metrics)
 
     def collect(self, iteration: int, key: PRNGKeyArray) -> tuple[list[Trajectory], int]:
@@ -154,15 +161,15 @@ class Trainer:
             policy = agent_policy(self.agent, num_episodes, key=key)
         self.phase(iteration, "collect")
         rollout = run_episodes(arena, episodes, policy, self.progress.advance)
-        for trajectory in rollout.trajectories:
-            self.buffer.add(trajectory)
-        return rollout.trajectories, rollout.use.failures
+        return self.keep(iteration, rollout.trajectories), rollout.use.failures
 
-    def episodes(self) -> Episodes:
-        """Everything collected, in arrays that have the same shape all through the run."""
-        size = self.config.collection
-        capacity = size.num_iterations * size.num_episodes
-        return Episodes.pad(self.buffer.trajectories, capacity, self.arena.episode_length)
+    def keep(self, iteration: int, collected: list[Trajectory]) -> list[Trajectory]:
+        """Write what was collected, and go on with the files instead of the arrays."""
+        self.run.save_data(iteration, collected)
+        mapped = self.run.iteration_data(iteration)
+        for trajectory in mapped:
+            self.buffer.add(trajectory)
+        return mapped
 
     def fit(self, iteration: int, key: PRNGKeyArray) -> dict[str, Any]:
         """Renew the statistics and go through the data `epochs` times.
@@ -180,12 +187,13 @@ class Trainer:
         )
         self.phase(iteration, "fit")
         state, history = self.learned.fit, []
-        for epoch in range(fitting.epochs):
-            one_key = jax.random.fold_in(epoch_key, epoch)
-            state, stats = fit_epoch(state, self.setup, data, independent=independent, key=one_key)
-            history.append(jax.device_get(stats))
-            check_epoch(history[-1], iteration, epoch)
-            self.progress.advance(1, loss=float(history[-1].loss))
+        with closing(data.stream(fitting.epochs, epoch_key)) as blocks:
+            for epoch in range(fitting.epochs):
+                of_epoch = itertools.islice(blocks, data.num_blocks)
+                state, stats = fit_blocks(state, self.setup, of_epoch, independent=independent)
+                check_epoch(stats, iteration, epoch)
+                self.progress.advance(1, loss=float(stats.loss))
+                history.append(stats)
         self.learned = Learned(state, data.statistics)
         return {
             "loss": float(history[-1].loss),
@@ -195,19 +203,13 @@ class Trainer:
             "transitions": self.buffer.num_transitions,
         }
 
-    def fit_data(self, key: PRNGKeyArray) -> FitData:
+    def fit_data(self, key: PRNGKeyArray) -> BlockedData:
         """Everything collected, with renewed statistics, ready to be fitted."""
-        config, fitting = self.config, self.config.fitting
-        trajectories, episodes = self.buffer.trajectories, self.episodes()
-        samples = Samples.table(
-            [len(trajectory) for trajectory in trajectories],
-            fitting.future_length,
-            capacity=episodes.action[..., 0].size * fitting.future_length,
-            drop_first=fitting.drop_first_anchor,
+        model, trajectories = self.config.model, self.buffer.trajectories
+        statistics = Statistics.fit(self.arena.task, trajectories, model.history_length)
+        return BlockedData(
+            trajectories, self.layout, statistics, self.setup, model.num_members, key
         )
-        statistics = Statistics.fit(self.arena.task, trajectories, config.model.history_length)
-        members = config.model.num_members
-        return make_data(episodes, samples, statistics, fitting, num_members=members, key=key)
 
     def evaluate(
         self, iteration: int, key: PRNGKeyArray
@@ -223,17 +225,16 @@ class Trainer:
     def save(
         self,
         iteration: int,
-        collected: list[Trajectory],
         tested: dict[str, list[Trajectory]],
         metrics: dict[str, Any],
         key: PRNGKeyArray,
     ) -> None:
         """Write everything of a finished iteration; the metrics come last."""
         run, config = self.run, self.config
-        run.save_data(iteration, collected)
         storage.save_tree(run.checkpoint(iteration), self.learned)
         run.write_evaluation(run.evaluation() + episode_rows(config, iteration, tested))
-        shares = head_shares(self.agent, self.setup, self.buffer.trajectories, self.episodes())
+        blocks = self.layout.in_order(self.buffer.trajectories)
+        shares = head_shares(self.agent, self.setup, blocks)
         numbered = [{"iteration": iteration, **row} for row in shares]
         run.write_assignments(run.assignments() + numbered)
         errors = [

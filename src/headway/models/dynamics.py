@@ -9,9 +9,12 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.config import ModelConfig
-from headway.data import History, Trajectory, history_action_moments
+from headway.data import History, Trajectory, history_action_moments, parts_of
+from headway.models.moments import Moments, merge_columns
 from headway.models.networks import Dense, DenseHeads, Normalizer, bound_logvar, swish
 from headway.tasks.base import Task
+
+PART_TRANSITIONS = 2**17  # read at once for statistics; the paper's whole data are one part
 
 
 class Prediction(NamedTuple):
@@ -118,17 +121,29 @@ class Statistics(eqx.Module):
 
     @classmethod
     def fit(cls, task: Task, trajectories: list[Trajectory], history_length: int) -> "Statistics":
-        """Recompute from all data so far, as at the start of every iteration (B.3)."""
-        obs = np.concatenate([t.obs[:-1] for t in trajectories])
-        next_obs = np.concatenate([t.obs[1:] for t in trajectories])
-        history_mean, history_std = history_action_moments(trajectories, history_length)
-        return cls(
-            Normalizer.fit(np.asarray(task.preprocess(jnp.asarray(obs)))),
-            Normalizer.fit(np.concatenate([t.action for t in trajectories])),
-            Normalizer.fit(np.asarray(task.target(jnp.asarray(obs), jnp.asarray(next_obs)))),
-            Normalizer.fit(np.asarray(task.target(jnp.asarray(next_obs), jnp.asarray(obs)))),
-            Normalizer.of_moments(history_mean, history_std),
-        )
+        """Recompute from all data so far, as at the start of every iteration (B.3).
+
+        The data are read once, in parts of `PART_TRANSITIONS`, and never held together.
+        """
+        parts = parts_of(trajectories, PART_TRANSITIONS)
+        found = merge_columns(transition_moments(task, part) for part in parts)
+        features, action, delta, backward = (Normalizer.of_moments(m.mean, m.std) for m in found)
+        history = history_action_moments(trajectories, history_length)
+        return cls(features, action, delta, backward, Normalizer.of_moments(*history))
+
+
+def transition_moments(
+    task: Task, trajectories: list[Trajectory]
+) -> tuple[Moments, Moments, Moments, Moments]:
+    """Moments of the features, actions, targets and backward targets of some transitions."""
+    obs = jnp.asarray(np.concatenate([t.obs[:-1] for t in trajectories]))
+    next_obs = jnp.asarray(np.concatenate([t.obs[1:] for t in trajectories]))
+    return (
+        Moments.of(np.asarray(task.preprocess(obs))),
+        Moments.of(np.concatenate([t.action for t in trajectories])),
+        Moments.of(np.asarray(task.target(obs, next_obs))),
+        Moments.of(np.asarray(task.target(next_obs, obs))),
+    )
 
 
 class MultiHeadDynamics(eqx.Module):

@@ -34,12 +34,6 @@ class Normalizer(eqx.Module):
             jnp.asarray(mean, jnp.float32), jnp.asarray(np.where(constant, 0, std), jnp.float32)
         )
 
-    @classmethod
-    def fit(cls, values: Float[np.ndarray, "*batch size"]) -> "Normalizer":
-        """Take mean and population standard deviation over all leading axes."""
-        flat = np.asarray(values, np.float64).reshape(-1, values.shape[-1])
-        return cls.of_moments(flat.mean(0), flat.std(0))
-
     @property
     def scale(self) -> Float[Array, "*size"]:
         """What `normalize` divides by: the standard deviation, or 1 where it is 0."""
