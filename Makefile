@@ -12,7 +12,7 @@ CONSTRAINED_PYTHONS ?= python3.11 python3.12
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow lint bench docs constraints clean
+.PHONY: help demo test test-slow lint bench profile docs constraints clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' Makefile | awk -F'|' '{ printf "make %-12s %s\n", $$1, $$2 }'
@@ -34,6 +34,9 @@ lint: $(VENV)/test.stamp $(VENV)/lint.stamp ## Check style, types and import rul
 
 bench: $(VENV)/test.stamp $(VENV)/bench.stamp ## Time planning, fitting and environments; wants an idle machine
 	@$(BIN)/python -m pytest benchmarks -o python_files='bench_*.py' -p no:xdist --benchmark-quiet
+
+profile: $(VENV)/test.stamp $(VENV)/bench.stamp ## Print what share of a plan its parts take
+	@$(BIN)/python benchmarks/profile_plan.py
 
 docs: $(VENV)/test.stamp ## Check that the links in README and docs lead somewhere (there is no site yet)
 	@$(BIN)/python -m pytest tests/test_package.py -k links

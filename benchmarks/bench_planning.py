@@ -1,6 +1,5 @@
 """One planning step at the paper's HalfCheetah size, and the memory it takes."""
 
-import itertools
 import resource
 import subprocess
 import sys
@@ -9,34 +8,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import pytest
-
-from headway.config import ModelConfig, PlannerConfig
-from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.planning.agent import Agent, AgentState
-from headway.tasks.catalog import env_spec
-
-MODEL = ModelConfig()
-PLANNER = PlannerConfig()
-
-
-def make_agent(num_envs: int) -> tuple[Agent, AgentState, jax.Array]:
-    """An untrained agent, its state after one step, and what it sees."""
-    task = env_spec("half-cheetah").make_task()
-    model = MultiHeadDynamics.init(MODEL, task, key=jax.random.key(0))
-    statistics = Statistics.identity(task, MODEL.history_length)
-    agent = Agent(model, statistics, task, PLANNER, MODEL.history_length)
-    obs = 0.1 * jax.random.normal(jax.random.key(1), (num_envs, task.obs_size))
-    state, _ = agent.act(agent.init(num_envs, key=jax.random.key(2)), obs)
-    return agent, state, obs
-
-
-def plan_flop(agent: Agent) -> float:
-    """Floating-point operations of the matrix products of one environment's plan."""
-    *hidden, features = (agent.task.feature_size + agent.task.action_size, *MODEL.hidden_sizes)
-    sizes = (*hidden, features, 2 * agent.task.obs_size)
-    per_call = 2 * sum(n * m for n, m in itertools.pairwise(sizes))
-    imagined = PLANNER.num_candidates * PLANNER.num_particles * PLANNER.horizon
-    return float(per_call * imagined * PLANNER.num_iterations)
+from workloads import make_agent, plan_flop
 
 
 @pytest.mark.parametrize("num_envs", [1, 10])
@@ -66,5 +38,6 @@ def peak_kib() -> int:
 if __name__ == "__main__":
     jnp.zeros(1).block_until_ready()
     before_plan = peak_kib()
-    jax.block_until_ready(make_agent(10)[1])
+    agent, state, obs = make_agent(10)
+    jax.block_until_ready(agent.act(state, obs))
     print(before_plan, peak_kib())
