@@ -22,5 +22,7 @@ def test_epoch(timed, report):
         f"  one update of {MODEL.num_members} x {FITTING.batch_size}: its share",
         1e3 * each,
         "ms",
-        **timing.ratio(update_flop(state.model, FITTING.batch_size), each),
+        **timing.rate.ratio(update_flop(state.model, FITTING.batch_size), each),
+        key="update",
     )
+    report.add("  updates per second", 1 / each, "/s", key="updates")

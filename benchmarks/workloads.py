@@ -1,6 +1,8 @@
 """What is timed: agents and fits at the paper's HalfCheetah sizes, and their operations."""
 
+import dataclasses
 import itertools
+import typing
 from typing import Any
 
 import jax
@@ -28,6 +30,14 @@ def make_agent(
     agent = Agent(dynamics, statistics, task, planner, model.history_length)
     obs = 0.1 * jax.random.normal(jax.random.key(1), (num_envs, task.obs_size))
     return agent, agent.init(num_envs, key=jax.random.key(2)), obs
+
+
+def planners() -> dict[str, PlannerConfig]:
+    """The paper's planner in each precision of matrix products that Headway offers."""
+    if "precision" not in {field.name for field in dataclasses.fields(PlannerConfig)}:
+        return {"float32": PlannerConfig()}
+    precisions = typing.get_args(typing.get_type_hints(PlannerConfig)["precision"])
+    return {name: PlannerConfig(**{"precision": name}) for name in precisions}
 
 
 def plan_flop(agent: Agent) -> float:
