@@ -8,11 +8,13 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 INSTALL := $(PIP) install -qq -c constraints.txt
 SPECS := pyproject.toml constraints.txt
+PEERS := $(VENV)-peers
 CONSTRAINED_PYTHONS ?= python3.11 python3.12
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow lint bench bench-million docs constraints clean
+.PHONY: help demo test test-slow lint docs constraints clean
+.PHONY: bench bench-million bench-save bench-growth bench-peers bench-runs profile
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' Makefile | awk -F'|' '{ printf "make %-14s %s\n", $$1, $$2 }'
@@ -38,6 +40,21 @@ bench: $(VENV)/test.stamp $(VENV)/bench.stamp ## Time planning, fitting and envi
 bench-million: $(VENV)/main.stamp ## Measure memory while fitting a million transitions, in minutes; Linux
 	@$(BIN)/python benchmarks/bench_million.py
 
+bench-save: $(VENV)/main.stamp ## Copy the latest results to results/speed/KIND/DATE.*
+	@$(BIN)/python benchmarks/save.py
+
+bench-growth: $(VENV)/main.stamp ## Measure how cost grows with environments, candidates, data, ... (6 minutes)
+	@$(BIN)/python benchmarks/growth.py
+
+bench-peers: $(VENV)/main.stamp $(PEERS)/peers.stamp ## Time a plan of mbrl-lib beside Headway's; installs PyTorch
+	@$(BIN)/python benchmarks/peers/compare.py --peer-python $(PEERS)/bin/python
+
+bench-runs: $(VENV)/main.stamp ## Time the paper's whole HalfCheetah and Pendulum runs; wants a GPU
+	@$(BIN)/python benchmarks/time_runs.py
+
+profile: $(VENV)/main.stamp ## Print what share of a plan its parts take
+	@$(BIN)/python benchmarks/profile_plan.py
+
 docs: $(VENV)/test.stamp ## Check that the links in README and docs lead somewhere (there is no site yet)
 	@$(BIN)/python -m pytest tests/test_package.py -k links
 
@@ -57,9 +74,9 @@ constraints: ## Rewrite constraints.txt from fresh installs of the newest versio
 	@sed -n '/^#/p' constraints.txt | cat - $(VENV)-constraints/pins.txt > $(VENV)-constraints/new.txt
 	@mv $(VENV)-constraints/new.txt constraints.txt
 
-clean: ## Remove caches and build leftovers; keeps .venv and runs
+clean: ## Remove caches and build leftovers; keeps .venv, runs and saved results
 	@rm -rf build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks
-	@rm -rf $(VENV)-constraints benchmarks/latest.json MUJOCO_LOG.TXT
+	@rm -rf $(VENV)-constraints benchmarks/latest MUJOCO_LOG.TXT
 	@find src tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # pip exists only where venv succeeded; a .venv that somebody else made is used as it is.
@@ -77,4 +94,13 @@ $(VENV)/%.stamp: $(VENV)/main.stamp
 	@echo "Installing what $* needs"
 	@$(INSTALL) --upgrade pip
 	@$(INSTALL) --group $*
+	@touch $@
+
+# mbrl-lib pins a Hydra that Python 3.11 cannot import and an OmegaConf that pip 24.1 refuses, so
+# newer ones are installed beside it. Where there is no CPU build of PyTorch it is the CUDA build.
+$(PEERS)/peers.stamp: benchmarks/peers/constraints.txt
+	@test -x $(PEERS)/bin/pip || $(PYTHON) -m venv $(PEERS)
+	@echo "Installing mbrl-lib into $(PEERS)"
+	@$(PEERS)/bin/python -m pip install -qq -c $< torch numpy hydra-core gymnasium termcolor tqdm packaging
+	@$(PEERS)/bin/python -m pip install -qq -c $< --no-deps mbrl
 	@touch $@

@@ -1,61 +1,68 @@
-"""One planning step at the paper's HalfCheetah size, and the memory it takes."""
+"""One planning step at the paper's HalfCheetah size: its time, its memory, its first call."""
 
-import resource
+import os
 import subprocess
 import sys
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import pytest
+from workloads import make_agent, planners
 
-from headway.config import ModelConfig, PlannerConfig
-from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.planning.agent import Agent, AgentState
+from headway.config import ModelConfig
 from headway.planning.flop import plan_flop
-from headway.tasks.catalog import env_spec
 
-MODEL = ModelConfig()
-PLANNER = PlannerConfig()
+FIRST_PLAN = Path(__file__).parent / "first_plan.py"
 
 
-def make_agent(num_envs: int) -> tuple[Agent, AgentState, jax.Array]:
-    """An untrained agent, its state after one step, and what it sees."""
-    task = env_spec("half-cheetah").make_task()
-    model = MultiHeadDynamics.init(MODEL, task, key=jax.random.key(0))
-    statistics = Statistics.identity(task, MODEL.history_length)
-    agent = Agent(model, statistics, task, PLANNER, MODEL.history_length)
-    obs = 0.1 * jax.random.normal(jax.random.key(1), (num_envs, task.obs_size))
-    state, _ = agent.act(agent.init(num_envs, key=jax.random.key(2)), obs)
-    return agent, state, obs
-
-
+@pytest.mark.parametrize("precision", planners())
 @pytest.mark.parametrize("num_envs", [1, 10])
-def test_plan(num_envs, timed, report):
-    agent, state, obs = make_agent(num_envs)
+def test_plan(num_envs, precision, timed, report):
+    planner = planners()[precision]
+    agent, state, obs = make_agent(num_envs, planner=planner)
+    flop = num_envs * plan_flop(ModelConfig(), planner, agent.task)
     timing = timed(lambda: agent.act(state, obs), rounds=7 if num_envs == 1 else 3)
-    flop = num_envs * plan_flop(MODEL, PLANNER, agent.task)
-    report.add(f"plan, {num_envs} env", timing.seconds, "s", **timing.ratio(flop))
+    report.add(
+        f"plan, {num_envs} env, {precision}",
+        timing.seconds,
+        "s",
+        **timing.rate.ratio(flop, timing.seconds),
+        key=f"plan-{num_envs}-{precision}",
+    )
 
 
 def test_peak_memory_of_plan(report):
-    done = subprocess.run([sys.executable, __file__], check=True, capture_output=True, text=True)
-    before, after = (int(word) / 2**20 for word in done.stdout.split())
-    report.add("plan, 10 env, peak memory of the process", after, "GiB")
-    report.add("  of which before the plan", before, "GiB")
+    measured = first_plan(10, {})
+    report.add(
+        "plan, 10 env, peak memory of the process",
+        measured["peak_gib"],
+        "GiB",
+        key="memory",
+    )
+    report.add("  of which before the plan", measured["before_gib"], "GiB")
 
 
-def peak_kib() -> int:
-    """The largest resident set of this process so far, in KiB."""
-    status = Path("/proc/self/status")
-    if status.exists():  # getrusage would count the parent's memory too
-        (line,) = [line for line in status.read_text().splitlines() if line.startswith("VmHWM")]
-        return int(line.split()[1])
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+def test_first_plan(report, tmp_path):
+    cold = first_plan(1, {"JAX_ENABLE_COMPILATION_CACHE": "false"})
+    cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path)}
+    first_plan(1, cache)
+    warm = first_plan(1, cache)
+    for name, key, measured in (("no cache", "cold", cold), ("cached", "warm", warm)):
+        report.add(
+            f"first plan of a process, 1 env, {name}",
+            measured["seconds"],
+            "s",
+            key=f"first-plan-{key}",
+        )
 
 
-if __name__ == "__main__":
-    jnp.zeros(1).block_until_ready()
-    before_plan = peak_kib()
-    jax.block_until_ready(make_agent(10)[1])
-    print(before_plan, peak_kib())
+def first_plan(num_envs: int, environment: dict[str, str]) -> dict[str, float]:
+    """What `first_plan.py` measures in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, str(FIRST_PLAN), str(num_envs)],
+        check=True,
+        capture_output=True,
+        text=True,
+        env=os.environ | environment,
+    )
+    words = dict(word.split("=") for word in done.stdout.split())
+    return {name: float(value) for name, value in words.items()}
