@@ -13,7 +13,8 @@ from headway.experiment.evaluation import episode_rows, evaluate_agent
 from headway.experiment.methods import make_config
 from headway.experiment.progress import Progress
 from headway.experiment.rollouts import Arena
-from headway.experiment.runs import EpisodeRow, RunDir
+from headway.experiment.runs import RunDir
+from headway.experiment.tables import EpisodeRow
 from headway.experiment.training import load_agent, train_run
 from headway.planning.controller import Controller
 from headway.report.figures import save_run_figures
@@ -39,7 +40,7 @@ class Run:
         return load(self.path, seed=seed)
 
 
-def train(
+def train(  # noqa: PLR0913 (keywords, all with a default)
     env: str,
     *,
     method: str = "tmcl",
@@ -48,6 +49,7 @@ def train(
     run_dir: str | Path | None = None,
     settings: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
+    resume_from_last_good: bool = False,
 ) -> Run:
     """Train a controller on environments whose physics vary; resume if it was begun before.
 
@@ -59,16 +61,23 @@ def train(
         run_dir: Where everything is written; `runs/ENV-METHOD-PRESET-seedSEED` by default.
         settings: Changes by dotted name, for example `{"planner.horizon": 20}`.
         progress: Shown while training; silent by default.
+        resume_from_last_good: Where a file of the run is damaged, go back to the newest
+            iteration whose files are all intact.
 
     Raises:
         UnknownNameError: No such environment, method or preset.
         ConfigError: A setting is unknown, of the wrong type or out of range.
-        RunError: The directory holds something else.
+        RunError: The directory holds something else, is damaged, or in use.
         BadEnvironmentError: The environment broke its contract.
         DivergenceError: Fitting lost all finite numbers.
     """
     config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
-    run = train_run(config, run_dir or default_run_dir(config), progress)
+    run = train_run(
+        config,
+        run_dir or default_run_dir(config),
+        progress,
+        resume_from_last_good=resume_from_last_good,
+    )
     figures = save_run_figures(run.path)
     return Run(run.path, config, run.metrics(), run.evaluation(), figures)
 

@@ -10,7 +10,7 @@ from headway.cli import main
 from headway.cli.commands import parse_train
 from headway.errors import RunError
 from headway.experiment.methods import METHODS, PRESETS, make_config
-from headway.experiment.runs import EpisodeRow
+from headway.experiment.tables import EpisodeRow
 from headway.settings import override
 
 
@@ -135,7 +135,7 @@ def test_evaluating_what_is_no_run(capsys, tmp_path):
     assert "allowed: a run directory" in err
 
 
-@pytest.mark.parametrize(("command", "advice"), [("train", "goes on after"), ("evaluate", "")])
+@pytest.mark.parametrize(("command", "advice"), [("train", "goes on where"), ("evaluate", "")])
 def test_ctrl_c_exits_130_with_one_line(capsys, monkeypatch, command, advice):
     def interrupt(*_, **__):
         raise KeyboardInterrupt

@@ -89,16 +89,19 @@ def random_policy(arena: Arena, rng: np.random.Generator) -> Policy:
     return lambda obs: (rng.uniform(-1.0, 1.0, shape).astype(np.float32), no_failures)
 
 
-def agent_policy(agent: Agent, num_envs: int, *, key: PRNGKeyArray) -> Policy:
-    """An agent that starts with an empty memory."""
-    state = agent.init(num_envs, key=key)
+class AgentPolicy:
+    """An agent and what it remembers of each environment; it starts with an empty memory."""
 
-    def act(obs):
-        nonlocal state
-        state, decision = agent.act(state, jnp.asarray(obs, jnp.float32))
+    def __init__(self, agent: Agent, num_envs: int, *, key: PRNGKeyArray):
+        self._agent = agent
+        self.state = agent.init(num_envs, key=key)
+
+    def __call__(
+        self, obs: Float[np.ndarray, "env obs"]
+    ) -> tuple[Float[np.ndarray, "env action"], Int[np.ndarray, " env"]]:
+        """See `Policy`."""
+        self.state, decision = self._agent.act(self.state, jnp.asarray(obs, jnp.float32))
         return jax.device_get((decision.action, decision.failures))
-
-    return act
 
 
 @dataclasses.dataclass(frozen=True)

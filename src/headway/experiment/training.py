@@ -1,7 +1,7 @@
 """The training loop: collect, fit, evaluate, save, and again (supplement A.2; fact sheet D)."""
 
 import dataclasses
-import time
+import functools
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,13 +13,17 @@ from jaxtyping import PRNGKeyArray
 from headway.config import Config
 from headway.data import Episodes, ReplayBuffer, Samples, Trajectory
 from headway.errors import DivergenceError, RunError
-from headway.experiment import storage
+from headway.experiment import arrays
 from headway.experiment.diagnostics import head_shares, prediction_error
 from headway.experiment.evaluation import episode_rows, evaluate_agent
+from headway.experiment.interrupts import StopRequest, stop_requests
 from headway.experiment.methods import check_options
 from headway.experiment.progress import Progress
-from headway.experiment.rollouts import Arena, Episode, agent_policy, random_policy, run_episodes
+from headway.experiment.progress_store import ProgressStore
+from headway.experiment.resumable import fit_part, fitted_before, resumable_episodes
+from headway.experiment.rollouts import AgentPolicy, Arena, Episode, Policy, random_policy
 from headway.experiment.runs import RunDir
+from headway.experiment.tensorboard import write_tensorboard
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import EpochStats, FitData, FitSetup, FitState, fit_epoch, make_data
 from headway.planning.agent import Agent
@@ -59,10 +63,13 @@ class Trainer:
     learned: Learned
     buffer: ReplayBuffer
     progress: Progress
+    stop: StopRequest
+    store: ProgressStore = dataclasses.field(init=False)
+    """Keeps what is done of the unfinished iteration."""
 
     @classmethod
-    def open(cls, config: Config, run: RunDir, progress: Progress) -> "Trainer":
-        """Begin a run, or go on with the one in the directory.
+    def open(cls, config: Config, run: RunDir, progress: Progress, stop: StopRequest) -> "Trainer":
+        """Begin a run, or go on with the one in the directory, which is locked.
 
         Raises:
             RunError: The directory holds another run, or a damaged one.
@@ -71,13 +78,14 @@ class Trainer:
         arena = Arena.make(config)
         run.create_or_resume(config)
         run.check()
+        run.tidy()
         setup = FitSetup(arena.task, config.fitting, config.model.history_length)
         buffer = ReplayBuffer(arena.task.obs_size, arena.task.action_size)
         for trajectory in run.load_data():
             buffer.add(trajectory)
         finished = run.finished_iterations
         learned = initial(config, arena.task) if finished == 0 else load_learned(run, config)
-        return cls(config, run, arena, setup, learned, buffer, progress)
+        return cls(config, run, arena, setup, learned, buffer, progress, stop)
 
     @property
     def agent(self) -> Agent:
@@ -111,14 +119,14 @@ class Trainer:
 
     def run_iteration(self, iteration: int) -> None:
         """Collect, fit, evaluate and save; only the last write makes it count."""
+        self.store = open_store(self.run, self.stop, self.progress)
         keys = Keys.of(self.config.seed, iteration)
-        clock = [time.perf_counter()]
-        collected, failures = self.collect(iteration, keys.collect)
-        clock.append(time.perf_counter())
-        fitting = self.fit(iteration, keys.fit)
-        clock.append(time.perf_counter())
-        tested, test_failures = self.evaluate(iteration, keys.evaluate)
-        clock.append(time.perf_counter())
+        with self.store.timing("collect"):
+            collected, failures = self.collect(iteration, keys.collect)
+        with self.store.timing("fit"):
+            fitting = self.fit(iteration, keys.fit)
+        with self.store.timing("evaluate"):
+            tested, test_failures = self.evaluate(iteration, keys.evaluate)
         metrics = {
             "iteration": iteration,
             "timesteps": self.buffer.num_transitions,
@@ -126,10 +134,7 @@ class Trainer:
             "fitting": fitting,
             "evaluation": {group: _summary(found) for group, found in tested.items()},
             "test_planner_failures": test_failures,
-            "seconds": {
-                name: round(clock[i + 1] - clock[i], 3)
-                for i, name in enumerate(("collect", "fit", "evaluate"))
-            },
+            "seconds": self.store.seconds,
         }
         self.save(iteration, collected, tested, metrics, keys.diagnose)
         self.progress.iteration_done(metrics)
@@ -141,12 +146,15 @@ class Trainer:
         num_episodes = config.collection.num_episodes
         seeds = rng.integers(2**31 - 1, size=num_episodes)
         episodes = [Episode(arena.sim_params.sample(rng), int(seed)) for seed in seeds]
-        if iteration == 0:
-            policy = random_policy(arena, rng)
-        else:
-            policy = agent_policy(self.agent, num_episodes, key=key)
+
+        def policy() -> Policy:
+            if iteration == 0:
+                return random_policy(arena, rng)
+            return AgentPolicy(self.agent, num_episodes, key=key)
+
         self.phase(iteration, "collect")
-        rollout = run_episodes(arena, episodes, policy, self.progress.advance)
+        advance = self.progress.advance
+        rollout = resumable_episodes(self.store, "collect", arena, episodes, policy, advance)
         for trajectory in rollout.trajectories:
             self.buffer.add(trajectory)
         return rollout.trajectories, rollout.planner_failures
@@ -172,13 +180,15 @@ class Trainer:
             or self.config.model.num_heads == 1
         )
         self.phase(iteration, "fit")
-        state, history = self.learned.fit, []
-        for epoch in range(fitting.epochs):
+        state, history = fitted_before(self.store, self.learned.fit)
+        self.progress.advance(len(history))
+        for epoch in range(len(history), fitting.epochs):
             one_key = jax.random.fold_in(epoch_key, epoch)
             state, stats = fit_epoch(state, self.setup, data, independent=independent, key=one_key)
             history.append(jax.device_get(stats))
             check_epoch(history[-1], iteration, epoch)
             self.progress.advance(1, loss=float(history[-1].loss))
+            self.store.offer("fit", functools.partial(fit_part, state, list(history)))
         self.learned = Learned(state, data.statistics)
         return {
             "loss": float(history[-1].loss),
@@ -210,8 +220,15 @@ class Trainer:
         if not groups:
             return {}, 0
         self.phase(iteration, "evaluate")
-        advance = self.progress.advance
-        return evaluate_agent(self.agent, self.arena, self.config, groups, key=key, on_step=advance)
+        return evaluate_agent(
+            self.agent,
+            self.arena,
+            self.config,
+            groups,
+            key=key,
+            on_step=self.progress.advance,
+            store=self.store,
+        )
 
     def save(
         self,
@@ -224,38 +241,67 @@ class Trainer:
         """Write everything of a finished iteration; the metrics come last."""
         run, config = self.run, self.config
         run.save_data(iteration, collected)
-        storage.save_tree(run.checkpoint(iteration), self.learned)
-        run.write_evaluation(run.evaluation() + episode_rows(config, iteration, tested))
+        arrays.save_tree(run.checkpoint(iteration), self.learned)
+        run.append_evaluation(episode_rows(config, iteration, tested))
         shares = head_shares(self.agent, self.setup, self.buffer.trajectories, self.episodes())
-        numbered = [{"iteration": iteration, **row} for row in shares]
-        run.write_assignments(run.assignments() + numbered)
+        run.append_assignments([{"iteration": iteration, **row} for row in shares])
         errors = [
             {"iteration": iteration, "group": group, "step": step + 1, "error": float(error)}
             for group, found in tested.items()
             for step, error in enumerate(prediction_error(self.agent, found, key=key))
         ]
-        run.write_prediction_errors(run.prediction_errors() + errors)
-        run.write_metrics([*run.metrics(), metrics])
+        run.append_prediction_errors(errors)
+        run.append_metrics([metrics])
         write_tensorboard(run.path, metrics)
-        run.checkpoint(iteration - 2).unlink(missing_ok=True)
+        run.finish(iteration)
+        self.store.clear()
 
 
-def train_run(config: Config, run_dir: str | Path, progress: Progress | None = None) -> RunDir:
+def train_run(
+    config: Config,
+    run_dir: str | Path,
+    progress: Progress | None = None,
+    *,
+    resume_from_last_good: bool = False,
+) -> RunDir:
     """Train until the last iteration, from wherever the run stands.
+
+    Ctrl-C and SIGTERM save what is done and stop. Only one process trains in a directory.
 
     Args:
         config: All settings.
         run_dir: A new directory, or one with the same settings.
         progress: Shown while training; silent by default.
+        resume_from_last_good: Where a file is damaged, forget the iterations that stand on it.
     """
-    with progress or Progress() as shown:
-        trainer = Trainer.open(config, RunDir(run_dir), shown)
-        todo = range(trainer.run.finished_iterations, config.collection.num_iterations)
+    run = RunDir(run_dir)
+    with progress or Progress() as shown, run.locked(), stop_requests() as stop:
+        if resume_from_last_good:
+            shown.message(went_back(run.go_back()))
+        trainer = Trainer.open(config, run, shown, stop)
+        todo = range(run.finished_iterations, config.collection.num_iterations)
         work = [(i, trainer.amount_of_work(i)) for i in todo]
         shown.schedule([(i, name, total) for i, amounts in work for name, total in amounts.items()])
         for iteration in todo:
             trainer.run_iteration(iteration)
-    return trainer.run
+            stop.answer()
+    return run
+
+
+def went_back(good: int | None) -> str:
+    """Word where a run goes on after a damage."""
+    return "begins anew" if good is None else f"goes on after iteration {good}, which is intact"
+
+
+def open_store(run: RunDir, stop: StopRequest, progress: Progress) -> ProgressStore:
+    """Take up what is done of the unfinished iteration, or nothing where that is damaged."""
+    store = run.partial(stop)
+    try:
+        store.open()
+    except RunError as error:
+        progress.message(f"{error} It is not used: the iteration begins anew.")
+        store.clear()
+    return store
 
 
 def check_epoch(stats: EpochStats, iteration: int, epoch: int) -> None:
@@ -300,7 +346,7 @@ def load_learned(run: RunDir, config: Config) -> Learned:
         )
     task = load_task(config)
     template = eqx.filter_eval_shape(lambda: initial(config, task))
-    return storage.load_tree(run.checkpoint(finished - 1), template)
+    return arrays.load_tree(run.checked_checkpoint(finished - 1), template)
 
 
 def load_agent(run: RunDir) -> Agent:
@@ -318,19 +364,6 @@ def load_task(config: Config) -> Task:
     check_options(config)
     spec = env_spec(config.env)
     return spec.make_task(**{**spec.options, **config.env_options})
-
-
-def write_tensorboard(path: Path, metrics: dict[str, Any]) -> None:
-    """Add one iteration's numbers to the TensorBoard log, over environment steps."""
-    from tensorboardX import SummaryWriter
-
-    suffix = f".{metrics['iteration']:03d}"
-    with SummaryWriter(str(path / "tensorboard"), filename_suffix=suffix) as writer:
-        for section in ("collection", "fitting", "evaluation", "seconds"):
-            for name, value in metrics[section].items():
-                number = value["return_mean"] if isinstance(value, dict) else value
-                if isinstance(number, int | float):
-                    writer.add_scalar(f"{section}/{name}", number, metrics["timesteps"])
 
 
 def _summary(trajectories: list[Trajectory]) -> dict[str, Any]:
