@@ -87,6 +87,8 @@ class Train:
     """Switches of the environment: NAME or NAME=on turns one on, NAME=off turns it off."""
     resume_from_last_good: Flag = False
     """Where a file of the run is damaged, go back to the newest iteration that is intact."""
+    ignore_limits: Flag = False
+    """Try what seems too large for the free memory."""
     json: Flag = False
     """Print one JSON line on stdout instead of tables."""
     quiet: Flag = False

@@ -36,6 +36,7 @@ def train(words: Sequence[str]) -> int:
         settings=settings,
         progress=make_progress(arguments.quiet),
         resume_from_last_good=arguments.resume_from_last_good,
+        ignore_limits=arguments.ignore_limits,
     )
     last = max((row.iteration for row in run.evaluation), default=0)
     rows = [row for row in run.evaluation if row.iteration == last]

@@ -85,6 +85,8 @@ def _sizes(values: Any) -> bool:
 
 
 def _num_bytes(spec: ArraySpec, at_most: int) -> int:
+    if 0 in spec.shape:
+        return 0
     size = spec.dtype.itemsize
     for length in spec.shape:
         size *= length

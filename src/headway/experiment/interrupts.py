@@ -53,7 +53,8 @@ def stop_requests() -> Iterator[StopRequest]:
         request.signal = number
         os.write(2, _NOTICE)  # a signal may come while something else is being printed
 
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.getsignal(number) or signal.SIG_DFL for number in numbers}
     for number in before:
         signal.signal(number, note)
     try:

@@ -94,9 +94,20 @@ class ProgressStore:
             Terminated: Likewise.
         """
         self._pending[name] = make
-        if self._stop or time.monotonic() - self._written >= EVERY:
+        if time.monotonic() - self._written >= EVERY:
             self.save()
-        self._stop.answer()
+        self.stop_if_asked()
+
+    def stop_if_asked(self) -> None:
+        """Save and stop, if a signal asked for it.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C was pressed; everything is saved.
+            Terminated: SIGTERM was sent; everything is saved.
+        """
+        if self._stop:
+            self.save()
+            self._stop.answer()
 
     def drop(self, name: str) -> None:
         """Forget a part."""

@@ -120,11 +120,15 @@ def resumable_episodes(
         # Random actions are as quick to draw again.
         return Recorder(made, store, tape) if isinstance(made, AgentPolicy) else made
 
+    def after_step(steps: int) -> None:
+        on_step(steps)
+        store.stop_if_asked()
+
     try:
-        rollout = run_episodes(arena, episodes, policy(), on_step)
+        rollout = run_episodes(arena, episodes, policy(), after_step)
     except _NotRepeatableError:
         store.drop(tape)
-        rollout = run_episodes(arena, episodes, policy(), on_step)
+        rollout = run_episodes(arena, episodes, policy(), after_step)
     store.drop(tape)
     store.offer(name, lambda: _finished(rollout))
     return rollout

@@ -111,7 +111,7 @@ def trajectories_from(arrays: Arrays, facts: Any, path: Path) -> list[Trajectory
         RunError: Arrays and facts do not fit together, or are no trajectories.
     """
     if not isinstance(facts, list) or len(arrays) != len(_TRAJECTORY) * len(facts):
-        raise RunError(f"{path}: .safetensors and .json do not fit together; restore both.")
+        raise RunError(f"{path}.json and its .safetensors do not fit together; restore both.")
     try:
         return [_trajectory(arrays, fact, f"{i}.") for i, fact in enumerate(facts)]
     except (KeyError, TypeError, ValueError, HeadwayError) as error:

@@ -17,6 +17,7 @@ from headway.experiment import arrays
 from headway.experiment.diagnostics import head_shares, prediction_error
 from headway.experiment.evaluation import episode_rows, evaluate_agent
 from headway.experiment.interrupts import StopRequest, stop_requests
+from headway.experiment.limits import MemoryNeed, check_memory, memory_need
 from headway.experiment.methods import check_options
 from headway.experiment.progress import Progress
 from headway.experiment.progress_store import ProgressStore
@@ -263,6 +264,7 @@ def train_run(
     progress: Progress | None = None,
     *,
     resume_from_last_good: bool = False,
+    ignore_limits: bool = False,
 ) -> RunDir:
     """Train until the last iteration, from wherever the run stands.
 
@@ -273,8 +275,15 @@ def train_run(
         run_dir: A new directory, or one with the same settings.
         progress: Shown while training; silent by default.
         resume_from_last_good: Where a file is damaged, forget the iterations that stand on it.
+        ignore_limits: Try what seems too large for the free memory.
+
+    Raises:
+        LimitError: The run needs more memory than is free.
+        RunError: The directory holds something else, is damaged, or in use.
     """
     run = RunDir(run_dir)
+    if not ignore_limits:
+        check_memory(need_of(config))
     with progress or Progress() as shown, run.locked(), stop_requests() as stop:
         if resume_from_last_good:
             shown.message(went_back(run.go_back()))
@@ -286,6 +295,12 @@ def train_run(
             trainer.run_iteration(iteration)
             stop.answer()
     return run
+
+
+def need_of(config: Config) -> MemoryNeed:
+    """The memory that training a configuration needs."""
+    length = config.collection.episode_length or env_spec(config.env).episode_length
+    return memory_need(config, load_task(config), length)
 
 
 def went_back(good: int | None) -> str:
@@ -345,6 +360,7 @@ def load_learned(run: RunDir, config: Config) -> Learned:
             " `headway train` command."
         )
     task = load_task(config)
+    check_memory(need_of(config).to_load)
     template = eqx.filter_eval_shape(lambda: initial(config, task))
     return arrays.load_tree(run.checked_checkpoint(finished - 1), template)
 
