@@ -1,9 +1,15 @@
 """A run that is killed anywhere, however often, ends like one that never was."""
 
+import errno
+
 import killing
 import numpy as np
 import pytest
-from killing import ALWAYS, NEVER, Killed
+from killing import ALWAYS, NEVER, Killed, Trigger
+
+from headway.errors import LimitError
+from headway.experiment import training
+from headway.experiment.progress import Progress
 
 
 @pytest.fixture(scope="module")
@@ -57,3 +63,22 @@ def test_ten_kills_change_nothing(reference, tmp_path, monkeypatch, num_places):
 @pytest.mark.parametrize("seed", range(1, 5))
 def test_a_hundred_kills_change_nothing(seed, reference, tmp_path, monkeypatch, num_places):
     check_kills(100, seed, reference, tmp_path, monkeypatch, num_places)
+
+
+@pytest.mark.parametrize("place", [1, 2, 40, 150, 400])
+def test_a_disk_that_runs_full_stops_the_run_and_changes_nothing(
+    place, reference, tmp_path, monkeypatch
+):
+    class FullDisk(Trigger):
+        def pull(self):
+            self.places += 1
+            if self.places >= place:
+                raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(killing, "Trigger", lambda _: FullDisk())
+    monkeypatch.setattr(killing, "KillingProgress", lambda _: Progress())
+    with pytest.raises(LimitError, match="too full to write"):
+        killing.train(killing.tiny_config(), tmp_path / "run", monkeypatch, every=ALWAYS)
+    assert not list((tmp_path / "run").rglob("*.writing"))
+    training.train_run(killing.tiny_config(), tmp_path / "run")
+    assert killing.result(tmp_path / "run") == killing.result(reference)

@@ -26,18 +26,19 @@ def train_on_a_forgetful_disk(path, left, place, every, rng, monkeypatch):
 
 def check_losses(wanted, seed, reference, tmp_path, monkeypatch):
     rng = np.random.default_rng(seed)
-    losses = 0
+    losses = runs = 0
     while losses < wanted:
-        path = tmp_path / f"start-{losses}"
+        runs += 1
+        path = tmp_path / f"start-{runs}"
         path.mkdir()
         every = (ALWAYS, NEVER)[rng.integers(2)]
         place = int(rng.integers(1, 600 if every == ALWAYS else 300))
-        left = tmp_path / f"left-{losses}"
+        left = tmp_path / f"left-{runs}"
         if not train_on_a_forgetful_disk(path, left, place, every, rng, monkeypatch):
             continue
         losses += 1
         training.train_run(killing.tiny_config(), left)
-        assert killing.result(left) == killing.result(reference), (seed, losses)
+        assert killing.result(left) == killing.result(reference), (seed, runs)
 
 
 def test_five_losses_of_power_change_nothing(reference, tmp_path, monkeypatch):

@@ -23,6 +23,7 @@ def need(**settings):
 
 def test_a_run_that_does_not_fit_is_refused_with_the_numbers(monkeypatch, tmp_path):
     monkeypatch.setattr(limits, "free_memory", lambda: 3 * GIB)
+    monkeypatch.setattr(limits, "resident", lambda: 0)
     config = make_config("pendulum", preset="smoke", settings={"planner.num_candidates": 10**8})
     with pytest.raises(LimitError, match=r"about .* GiB .*planning .*3 GiB is free.*ignore-limits"):
         training.train_run(config, tmp_path / "run")
@@ -108,6 +109,24 @@ def test_where_nothing_is_known_nothing_is_refused(monkeypatch, tmp_path):
     monkeypatch.setattr(limits, "MEMINFO", tmp_path / "none")
     assert limits.free_memory() is None
     limits.check_memory(need()._replace(planning=10**18))
+
+
+def test_an_accelerator_has_a_memory_of_its_own(monkeypatch):
+    class Device:
+        platform, device_kind = "gpu", "Toy 9"
+
+        def memory_stats(self):
+            return {"bytes_limit": 2 * GIB, "bytes_in_use": GIB}
+
+    monkeypatch.setattr(limits.jax, "local_devices", lambda: [Device()])
+    monkeypatch.setattr(limits, "free_memory", lambda: 10 * GIB)
+    limits.check_memory(need())
+    with pytest.raises(LimitError, match=r"1 GiB is free on Toy 9"):
+        limits.check_memory(need()._replace(planning=2 * GIB))
+    with pytest.raises(LimitError, match=r"on this machine"):
+        limits.check_memory(need()._replace(process=20 * GIB))
+    monkeypatch.setattr(Device, "memory_stats", lambda self: None)
+    limits.check_memory(need()._replace(planning=20 * GIB))
 
 
 MEASURE = """

@@ -41,7 +41,8 @@ def write_bytes(path: Path, content: bytes) -> None:
     temporary.unlink(missing_ok=True)
     try:
         # Never through a link that somebody left there.
-        handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
+        handle = os.open(temporary, flags, 0o666)
         with os.fdopen(handle, "wb") as file:
             file.write(content)
             file.flush()
@@ -108,9 +109,10 @@ def open_file(path: Path, max_bytes: int | None = None) -> BinaryIO:
         RunError: The file is missing, no regular file, or too large.
     """
     try:
-        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+        handle = os.open(path, flags)
     except FileNotFoundError:
-        raise RunError(f"{path} is missing; is {path.parent} part of a run directory?") from None
+        raise RunError(f"{path} is missing; check the path, or restore the file.") from None
     except OSError as error:
         raise RunError(f"{path} cannot be read: {error.strerror}; check the path.") from None
     file = os.fdopen(handle, "rb") if stat.S_ISREG(os.fstat(handle).st_mode) else None

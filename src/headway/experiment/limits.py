@@ -4,6 +4,8 @@ import itertools
 from pathlib import Path
 from typing import NamedTuple
 
+import jax
+
 from headway.config import Config
 from headway.errors import LimitError
 from headway.tasks.base import Task
@@ -23,7 +25,7 @@ class MemoryNeed(NamedTuple):
     process: int
     """Before any array."""
     model: int
-    """Weights, Adam's moments, and the copies that an update makes."""
+    """Weights and Adam's moments, with the copies that an update and a checkpoint make."""
     data: int
     """Everything collected, and the table of samples."""
     fitting: int
@@ -39,7 +41,7 @@ class MemoryNeed(NamedTuple):
     @property
     def to_load(self) -> "MemoryNeed":
         """What is needed when the model is only read."""
-        return self._replace(data=0, fitting=0, planning=0)
+        return self._replace(process=0, data=0, fitting=0, planning=0)
 
     @property
     def to_test(self) -> "MemoryNeed":
@@ -66,7 +68,7 @@ def memory_need(config: Config, task: Task, episode_length: int) -> MemoryNeed:
     rows = members * samples * FLOAT
     return MemoryNeed(
         PROCESS,
-        8 * FLOAT * num_parameters(config, task),
+        16 * FLOAT * num_parameters(config, task),
         episodes + table + rows,
         6 * rows + _batch(config, task) + _assignment(config, task, episode_length),
         _planning(config, task),
@@ -120,15 +122,27 @@ def check_memory(need: MemoryNeed) -> None:
     """Refuse what does not fit, before the system's killer does.
 
     Raises:
-        LimitError: The estimate is above what is free.
+        LimitError: The estimate is above what is free on the machine or on its accelerator.
     """
+    device = jax.local_devices()[0]
+    on_host = need
+    if device.platform != "cpu":
+        on_host = need._replace(model=0, fitting=0, planning=0)
+        stats = device.memory_stats() or {}
+        limit, used = stats.get("bytes_limit"), stats.get("bytes_in_use", 0)
+        _compare(need._replace(process=0), limit and limit - used, f"on {device.device_kind}")
     free = free_memory()
-    if free is None or need.total - resident() <= free:
+    _compare(on_host, free if free is None else free + resident(), "on this machine")
+
+
+def _compare(need: MemoryNeed, free: int | None, where: str) -> None:
+    if free is None or need.total <= free:
         return
-    parts = ", ".join(f"{name} {gib(value)}" for name, value in need._asdict().items())
+    parts = ", ".join(f"{name} {gib(value)}" for name, value in need._asdict().items() if value)
     raise LimitError(
-        f"this run needs about {gib(need.total)} GiB of memory ({parts}), {gib(free)} GiB is free;"
-        " choose smaller sizes, or pass --ignore-limits (ignore_limits=True) to try all the same."
+        f"this run needs about {gib(need.total)} GiB of memory ({parts}), {gib(free)} GiB is free"
+        f" {where}; choose smaller sizes, or pass --ignore-limits (ignore_limits=True) to try all"
+        " the same."
     )
 
 

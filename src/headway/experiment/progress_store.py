@@ -59,7 +59,8 @@ class ProgressStore:
             return
         manifest, facts = Manifest.read_with_facts(path)
         if (manifest.iteration, facts.get("origin")) != (self._iteration, self._origin):
-            return  # left by an iteration that was finished, or by another run
+            self.clear()  # left by an iteration that was finished, or by another run
+            return
         manifest.check(self.folder)
         try:
             parts = {n: (part["file"], dict(part["facts"])) for n, part in facts["parts"].items()}

@@ -294,6 +294,7 @@ def train_run(
         for iteration in todo:
             trainer.run_iteration(iteration)
             stop.answer()
+        run.partial(stop).clear()
     return run
 
 
