@@ -23,13 +23,14 @@ if TYPE_CHECKING:
     from headway.errors import ConfigError as ConfigError
     from headway.errors import DivergenceError as DivergenceError
     from headway.errors import HeadwayError as HeadwayError
+    from headway.errors import LimitError as LimitError
     from headway.errors import RunError as RunError
     from headway.errors import UnknownNameError as UnknownNameError
     from headway.experiment.methods import METHODS as METHODS
     from headway.experiment.methods import PRESETS as PRESETS
     from headway.experiment.methods import make_config as make_config
-    from headway.experiment.runs import EpisodeRow as EpisodeRow
     from headway.experiment.runs import RunDir as RunDir
+    from headway.experiment.tables import EpisodeRow as EpisodeRow
     from headway.models.dynamics import MultiHeadDynamics as MultiHeadDynamics
     from headway.planning.agent import Agent as Agent
     from headway.planning.controller import Controller as Controller
@@ -55,11 +56,13 @@ _HOME = {
         "DivergenceError",
         "BadEnvironmentError",
         "HeadwayError",
+        "LimitError",
         "RunError",
         "UnknownNameError",
     ),
     "experiment.methods": ("METHODS", "PRESETS", "make_config"),
-    "experiment.runs": ("EpisodeRow", "RunDir"),
+    "experiment.runs": ("RunDir",),
+    "experiment.tables": ("EpisodeRow",),
     "models.dynamics": ("MultiHeadDynamics",),
     "planning.agent": ("Agent",),
     "planning.controller": ("Controller",),

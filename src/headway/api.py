@@ -10,11 +10,13 @@ import jax
 from headway.config import Config
 from headway.errors import unknown_name
 from headway.experiment.evaluation import PlanningCost, episode_rows, evaluate_agent
+from headway.experiment.limits import check_memory
 from headway.experiment.methods import make_config, tested_config
 from headway.experiment.progress import Progress
 from headway.experiment.rollouts import Arena
-from headway.experiment.runs import EpisodeRow, RunDir
-from headway.experiment.training import load_agent, train_run
+from headway.experiment.runs import RunDir
+from headway.experiment.tables import EpisodeRow
+from headway.experiment.training import load_agent, need_of, train_run
 from headway.planning.controller import Controller
 from headway.report.figures import save_run_figures
 
@@ -61,7 +63,7 @@ class Evaluation(Sequence[EpisodeRow]):
         return len(self.rows)
 
 
-def train(
+def train(  # noqa: PLR0913 (keywords, all with a default)
     env: str,
     *,
     method: str = "tmcl",
@@ -70,6 +72,8 @@ def train(
     run_dir: str | Path | None = None,
     settings: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
+    resume_from_last_good: bool = False,
+    ignore_limits: bool = False,
 ) -> Run:
     """Train a controller on environments whose physics vary; resume if it was begun before.
 
@@ -81,16 +85,26 @@ def train(
         run_dir: Where everything is written; `runs/ENV-METHOD-PRESET-seedSEED` by default.
         settings: Changes by dotted name, for example `{"planner.horizon": 20}`.
         progress: Shown while training; silent by default.
+        resume_from_last_good: Where a file of the run is damaged, go back to the newest
+            iteration whose files are all intact.
+        ignore_limits: Try what seems too large for the free memory.
 
     Raises:
         UnknownNameError: No such environment, method or preset.
         ConfigError: A setting is unknown, of the wrong type or out of range.
-        RunError: The directory holds something else.
+        RunError: The directory holds something else, is damaged, or in use.
+        LimitError: The run needs more memory than is free, or the disk is full.
         BadEnvironmentError: The environment broke its contract.
         DivergenceError: Fitting lost all finite numbers.
     """
     config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
-    run = train_run(config, run_dir or default_run_dir(config), progress)
+    run = train_run(
+        config,
+        run_dir or default_run_dir(config),
+        progress,
+        resume_from_last_good=resume_from_last_good,
+        ignore_limits=ignore_limits,
+    )
     figures = save_run_figures(run.path)
     return Run(run.path, config, run.metrics(), run.evaluation(), figures)
 
@@ -118,12 +132,14 @@ def evaluate(
         UnknownNameError: No such group.
         ConfigError: A setting is unknown, of the wrong type or out of range, or one that
             training has fixed.
+        LimitError: Planning needs more memory than is free.
     """
     run = RunDir(run_dir)
     changes = dict(settings or {})
     if num_episodes is not None:
         changes["evaluation.num_episodes"] = num_episodes
     config = tested_config(run.config(), changes)
+    check_memory(need_of(config).to_test)
     agent = load_agent(run, config)
     arena = Arena.make(config)
     known = arena.sim_params.group_names

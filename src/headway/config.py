@@ -6,17 +6,21 @@ released code. A setting is addressed as `section.name`, for example `planner.ho
 
 import dataclasses
 import difflib
-import math
 import typing
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from headway.errors import ConfigError
+from headway.errors import ConfigError, shown
 from headway.sim_params import SimParamSets
 
 Oracle = Literal["independent", "transition", "trajectory"]
 OptimizerName = Literal["cem", "icem", "mppi", "random-shooting"]
 HeadSelection = Literal["adaptive", "average", "random"]
+
+LARGEST = 10**9
+"""No number of anything is larger; a file that says so is wrong, or means harm."""
+MAX_LAYERS = 64
+"""Hidden layers of a network."""
 
 
 class _Problems:
@@ -29,26 +33,32 @@ class _Problems:
     def at_least(self, minimum: float, *names: str) -> None:
         for name in names:
             value = getattr(self._section, name)
-            if not (math.isfinite(value) and value >= minimum):
-                self._found.append(f"{name} is {value}, allowed: at least {minimum}")
+            if not minimum <= value:
+                self._found.append(f"{name} is {shown(value)}, allowed: at least {minimum}")
+            elif value > LARGEST:
+                self._found.append(f"{name} is {shown(value)}, allowed: at most {LARGEST:,}")
 
     def between(self, low: float, high: float, *names: str) -> None:
         for name in names:
             value = getattr(self._section, name)
             if not low <= value <= high:
-                self._found.append(f"{name} is {value}, allowed: {low} to {high}")
+                self._found.append(f"{name} is {shown(value)}, allowed: {low} to {high}")
 
     def one_of(self, name: str, allowed: tuple[str, ...]) -> None:
         value = getattr(self._section, name)
         if value not in allowed:
-            close = difflib.get_close_matches(str(value), allowed, n=1)
+            close = difflib.get_close_matches(str(value)[:80], allowed, n=1)
             hint = f" (did you mean {close[0]!r}?)" if close else ""
-            self._found.append(f"{name} is {value!r}{hint}, allowed: {', '.join(allowed)}")
+            self._found.append(f"{name} is {shown(value)}{hint}, allowed: {', '.join(allowed)}")
 
     def sizes(self, name: str) -> None:
         value = getattr(self._section, name)
         if not value or any(size < 1 for size in value):
-            self._found.append(f"{name} is {value}, allowed: one or more widths of at least 1")
+            found = f"{name} is {shown(value)}, allowed: one or more widths of at least 1"
+            self._found.append(found)
+        elif len(value) > MAX_LAYERS or max(value) > LARGEST:
+            found = f"{name} is {shown(value)}, allowed: {MAX_LAYERS} widths up to {LARGEST:,}"
+            self._found.append(found)
 
     def require(self, condition: bool, text: str) -> None:
         if not condition:

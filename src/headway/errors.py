@@ -1,7 +1,12 @@
 """The errors Headway raises: each says what, got, allowed, and what to do."""
 
 import difflib
+import reprlib
 from collections.abc import Iterable
+from typing import Any
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 80
 
 
 class HeadwayError(Exception):
@@ -31,6 +36,18 @@ class DivergenceError(HeadwayError, ArithmeticError):
     """Fitting produced non-finite numbers that could not be repaired."""
 
 
+class LimitError(HeadwayError, RuntimeError):
+    """The machine lacks the memory or the disk that a run needs."""
+
+
+def shown(value: Any) -> str:
+    """A value as it stands in a message: like `repr`, but never long."""
+    try:
+        return _SHORT.repr(value)
+    except ValueError:  # Python refuses to write out whole numbers of thousands of digits
+        return "a number of thousands of digits"
+
+
 def unknown_name(kind: str, got: str, allowed: Iterable[str]) -> UnknownNameError:
     """Build the error for a name that is not in its table.
 
@@ -43,6 +60,6 @@ def unknown_name(kind: str, got: str, allowed: Iterable[str]) -> UnknownNameErro
         An error whose text suggests the closest allowed name.
     """
     names = sorted(allowed)
-    close = difflib.get_close_matches(got, names, n=1, cutoff=0.5)
+    close = difflib.get_close_matches(got[:80], names, n=1, cutoff=0.5)
     hint = f" Did you mean {close[0]!r}?" if close else ""
-    return UnknownNameError(f"unknown {kind} {got!r}.{hint} Allowed: {', '.join(names)}.")
+    return UnknownNameError(f"unknown {kind} {shown(got)}.{hint} Allowed: {', '.join(names[:99])}.")

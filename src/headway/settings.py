@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 from headway.config import Config
-from headway.errors import ConfigError
+from headway.errors import ConfigError, shown
 from headway.sim_params import SimParamSets
 
 
@@ -67,7 +67,7 @@ def differences(old: Config, new: Config) -> list[str]:
     """Return one line per setting that differs, for people to read."""
     before, after = _flatten(to_dict(old)), _flatten(to_dict(new))
     return [
-        f"{name}: {before.get(name)} -> {after.get(name)}"
+        f"{name}: {shown(before.get(name))} -> {shown(after.get(name))}"
         for name in sorted({*before, *after})
         if before.get(name) != after.get(name)
     ]
@@ -75,6 +75,7 @@ def differences(old: Config, new: Config) -> list[str]:
 
 def unknown_setting(name: str, known: list[str]) -> str:
     """Word the error for an unknown setting, with the closest known one."""
+    name = name[:80]
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
     if not close:
         tails = {full.rpartition(".")[2]: full for full in known}
@@ -96,7 +97,7 @@ def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def _build(cls: type, values: Any, prefix: str) -> Any:
     if not isinstance(values, Mapping):
         section = prefix.removesuffix(".") or "config"
-        raise ConfigError(f"{section} is {values!r}, allowed: a table of settings.")
+        raise ConfigError(f"{section} is {shown(values)}, allowed: a table of settings.")
     hints = typing.get_type_hints(cls)
     fields = [field.name for field in dataclasses.fields(cls)]
     for name in values:
@@ -141,8 +142,11 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
         if isinstance(value, Mapping) and all(isinstance(v, bool) for v in value.values()):
             return dict(value)
     elif hint is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            pass
     elif isinstance(hint, type) and type(value) is hint:
         return value
     wanted = getattr(hint, "__name__", str(hint)) if origin is None else str(hint)
-    raise ConfigError(f"{name} is {value!r}, allowed: {wanted.replace('typing.', '')}.")
+    raise ConfigError(f"{name} is {shown(value)}, allowed: {wanted.replace('typing.', '')}.")

@@ -3,14 +3,18 @@
 import dataclasses
 import itertools
 import math
+import sys
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from headway.errors import ConfigError, unknown_name
+from headway.errors import ConfigError, shown, unknown_name
 
 Values = Mapping[str, tuple[float, ...]]
+
+MAX_COMBINATIONS = 100_000
+"""Physics that one group may stand for."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,14 +40,16 @@ class SimParamSets:
         _check_values("train", self.train)
         if not isinstance(self.unseen, Mapping):
             raise ConfigError(
-                f"sim_params unseen is {self.unseen!r}, allowed: parameter values by group name."
+                f"sim_params unseen is {shown(self.unseen)}, allowed: parameter values by"
+                " group name."
             )
         for name, values in self.unseen.items():
             if name == "train" or not isinstance(name, str):
                 raise ConfigError(
-                    f"sim_params unseen has a group {name!r}, allowed: names other than 'train'."
+                    f"sim_params unseen has a group {shown(name)}, allowed: names other than"
+                    " 'train'."
                 )
-            _check_values(f"unseen group {name!r}", values)
+            _check_values(f"unseen group {shown(name)}", values)
             _check_same_names(name, values, self.train)
 
     @property
@@ -90,7 +96,7 @@ class SimParamSets:
         """
         if not isinstance(values, Mapping) or "train" not in values:
             raise ConfigError(
-                f"sim_params is {values!r}, allowed: {{'train': {{name: [values]}}, 'unseen':"
+                f"sim_params is {shown(values)}, allowed: {{'train': {{name: [values]}}, 'unseen':"
                 " {group: {name: [values]}}}."
             )
         for key in values:
@@ -108,13 +114,20 @@ def _check_values(where: str, values: Any) -> None:
     """Refuse anything but non-empty tuples of finite numbers by name."""
     if not isinstance(values, Mapping) or not values:
         raise ConfigError(
-            f"sim_params {where} is {values!r}, allowed: one or more values for each parameter."
+            f"sim_params {where} is {shown(values)}, allowed: one or more values for each"
+            " parameter."
         )
     for name, numbers in values.items():
         if not isinstance(numbers, tuple) or not numbers or not all(map(_is_finite, numbers)):
             raise ConfigError(
-                f"sim_params {where}, {name}, is {numbers!r}, allowed: one or more finite numbers."
+                f"sim_params {where}, {str(name)[:80]}, is {shown(numbers)}, allowed: one or more"
+                " finite numbers."
             )
+    if math.prod(map(len, values.values())) > MAX_COMBINATIONS:
+        raise ConfigError(
+            f"sim_params {where} has too many combinations of values, allowed: at most"
+            f" {MAX_COMBINATIONS:,}."
+        )
 
 
 def _check_same_names(group: str, values: Values, train: Values) -> None:
@@ -132,7 +145,7 @@ def _check_same_names(group: str, values: Values, train: Values) -> None:
 
 def _is_finite(value: Any) -> bool:
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    return number and math.isfinite(value)
+    return number and abs(value) <= sys.float_info.max
 
 
 def _to_lists(values: Values) -> dict[str, list[float]]:

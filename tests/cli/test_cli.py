@@ -10,8 +10,10 @@ from headway.cli import main
 from headway.cli.commands import parse_train
 from headway.errors import RunError
 from headway.experiment.evaluation import PlanningCost
+from headway.experiment.interrupts import Terminated
 from headway.experiment.methods import METHODS, PRESETS, make_config
-from headway.experiment.runs import EpisodeRow, RunDir
+from headway.experiment.runs import RunDir
+from headway.experiment.tables import EpisodeRow
 from headway.settings import override
 
 
@@ -151,7 +153,7 @@ def test_evaluating_what_is_no_run(capsys, tmp_path):
     assert "allowed: a run directory" in err
 
 
-@pytest.mark.parametrize(("command", "advice"), [("train", "goes on after"), ("evaluate", "")])
+@pytest.mark.parametrize(("command", "advice"), [("train", "goes on where"), ("evaluate", "")])
 def test_ctrl_c_exits_130_with_one_line(capsys, monkeypatch, trained, command, advice):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
@@ -161,6 +163,23 @@ def test_ctrl_c_exits_130_with_one_line(capsys, monkeypatch, trained, command, a
     assert (code, out) == (130, "")
     assert err.count("\n") == 1
     assert advice in err
+
+
+def test_sigterm_exits_143_with_one_line(capsys, monkeypatch):
+    def terminate(*_, **__):
+        raise Terminated(143)
+
+    monkeypatch.setattr(api, "train", terminate)
+    code, out, err = run(capsys, "train", "pendulum")
+    assert (code, out) == (143, "")
+    assert err == "terminated; the same command goes on where this one stopped\n"
+
+
+def test_train_passes_on_what_to_do_about_damage_and_limits(capsys, calls):
+    run(capsys, "train", "pendulum", "--preset", "smoke", "--resume-from-last-good")
+    run(capsys, "train", "pendulum", "--preset", "smoke", "--ignore-limits")
+    asked = [(call["resume_from_last_good"], call["ignore_limits"]) for call in calls]
+    assert asked == [(True, False), (False, True)]
 
 
 def test_settings_are_those_that_differ_from_the_preset():
@@ -191,10 +210,12 @@ def test_physics_from_a_file(tmp_path):
 
 def test_damaged_physics_file(capsys, tmp_path):
     path = tmp_path / "physics.json"
-    path.write_text("{")
-    code, _, err = run(capsys, "train", "pendulum", "--sim-params", str(path))
-    assert code == 1
-    assert "is not JSON" in err
+    for text in ("{", "[" * 100_000, '{"train": {"length": [NaN]}}', '{"a": 1, "a": 2}'):
+        path.write_text(text)
+        code, _, err = run(capsys, "train", "pendulum", "--sim-params", str(path))
+        assert code == 1
+        assert "is not JSON" in err
+        assert err.count("\n") == 1
 
 
 def test_help_shows_the_defaults_of_the_preset(capsys):

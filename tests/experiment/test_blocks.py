@@ -137,6 +137,19 @@ def test_updates_see_every_sample_of_every_block_once(monkeypatch):
         assert sorted(obs.tolist()) == wanted
 
 
+@pytest.mark.parametrize("num_episodes", [2, 7])
+def test_a_stream_goes_on_at_any_epoch(num_episodes):
+    data = blocked(num_episodes)
+    whole = list(data.stream(3, KEY))
+    for first in range(4):
+        rest = list(data.stream(3, KEY, first=first))
+        wanted = whole[first * data.num_blocks :]
+        assert len(rest) == len(wanted)
+        for one, other in zip(rest, wanted, strict=True):
+            assert trees_equal(one.data, other.data)
+            assert jax.random.key_data(one.key).tolist() == jax.random.key_data(other.key).tolist()
+
+
 def test_episodes_are_dealt_anew_in_every_epoch_and_the_same_for_the_same_key():
     data = blocked(2)
     first, again = list(data.stream(2, KEY)), list(data.stream(2, KEY))

@@ -1,5 +1,6 @@
 """Data files opened memory-mapped: the same numbers, read-only, and damage is named."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -8,7 +9,7 @@ import safetensors.numpy
 
 import toys
 from headway.errors import RunError
-from headway.experiment import storage
+from headway.experiment import files, storage
 from headway.experiment.mapped import map_arrays
 
 
@@ -56,20 +57,20 @@ def test_numbers_are_read_from_the_file_when_they_are_touched(path):
 
 def test_views_outlive_a_file_that_is_replaced(path):
     mapped, before = map_arrays(path), safetensors.numpy.load_file(path)
-    storage.write_bytes(path, b"something else")
+    files.write_bytes(path, b"something else")
     np.testing.assert_array_equal(mapped["0.obs"], before["0.obs"])
 
 
 @pytest.mark.parametrize("keep", [0, 7, 10, 100, -1])
 def test_a_damaged_file_is_named(keep, path):
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(RunError, match=r"a\.safetensors is damaged .*allowed: safetensors"):
+    with pytest.raises(RunError, match=r"a\.safetensors is damaged: "):
         map_arrays(path)
 
 
 def test_a_file_of_other_types_is_refused(tmp_path):
     safetensors.numpy.save_file({"0.obs": np.zeros(3, np.int8)}, tmp_path / "b.safetensors")
-    with pytest.raises(RunError, match=r"b\.safetensors is damaged \('I8'\)"):
+    with pytest.raises(RunError, match=r"b\.safetensors is damaged: .* an unknown type"):
         map_arrays(tmp_path / "b.safetensors")
 
 
@@ -79,7 +80,8 @@ def test_a_missing_file_is_named(tmp_path):
 
 
 def test_trajectories_come_back_as_they_were_but_stay_in_their_file(tmp_path):
-    saved = [toys.random_trajectory(n, seed=n, gain=n) for n in (3, 1)]
+    toy = [toys.random_trajectory(n, seed=n, gain=n) for n in (3, 1)]
+    saved = [dataclasses.replace(t, reward=t.reward.astype(np.float64)) for t in toy]
     storage.save_trajectories(tmp_path / "data", saved)
     loaded = storage.load_trajectories(tmp_path / "data")
     assert json.loads((tmp_path / "data.json").read_text())[0]["sim_params"] == {"gain": 3.0}

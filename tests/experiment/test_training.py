@@ -9,7 +9,8 @@ import pytest
 
 import headway
 from headway.errors import ConfigError, RunError
-from headway.experiment import storage, training
+from headway.experiment import arrays, training
+from headway.experiment.interrupts import StopRequest
 from headway.experiment.methods import make_config
 from headway.experiment.progress import Progress
 from headway.experiment.runs import RunDir
@@ -24,13 +25,13 @@ def untimed(run_dir: Path) -> list[dict]:
 
 
 def contents(run_dir: Path) -> dict[str, bytes]:
-    """Everything a run wrote, apart from times."""
+    """Everything a run wrote, apart from times, and manifests, which hold checksums of times."""
     return {
         str(path.relative_to(run_dir)): path.read_bytes()
         for path in sorted(run_dir.rglob("*"))
         if path.is_file()
         and path.name != "metrics.jsonl"
-        and not {"tensorboard", "figures"} & set(path.parts)
+        and not {"tensorboard", "figures", "manifests"} & set(path.parts)
     }
 
 
@@ -119,9 +120,10 @@ def test_a_run_in_blocks_resumes_to_the_same_end(reference, tmp_path, monkeypatc
 
 def test_a_run_goes_on_with_its_files_and_not_with_arrays(tmp_path):
     config = make_config("pendulum", preset="smoke", settings=TINY)
-    trainer = training.Trainer.open(config, RunDir(tmp_path / "run"), Progress())
+    asked = (config, RunDir(tmp_path / "run"), Progress(), StopRequest())
+    trainer = training.Trainer.open(*asked)
     trainer.run_iteration(0)
-    again = training.Trainer.open(config, RunDir(tmp_path / "run"), Progress())
+    again = training.Trainer.open(*asked)
     for found in (trainer, again):
         assert len(found.buffer) == 2
         for trajectory in found.buffer.trajectories:
@@ -248,14 +250,14 @@ def test_damaged_checkpoint_is_named(keep, reference, tmp_path):
     config = RunDir(reference).config()
     template = training.initial(config, training.load_task(config))
     with pytest.raises(RunError, match=r"checkpoint\.safetensors is damaged"):
-        storage.load_tree(damaged, template)
+        arrays.load_tree(damaged, template)
 
 
 def test_checkpoint_of_another_model_is_refused(reference):
     config = make_config("pendulum", preset="smoke", settings={"model.hidden_sizes": (8, 8)})
     template = training.initial(config, training.load_task(config))
     with pytest.raises(RunError, match="belongs to another model"):
-        storage.load_tree(RunDir(reference).checkpoint(1), template)
+        arrays.load_tree(RunDir(reference).checkpoint(1), template)
 
 
 def test_heads_of_a_run_share_every_segment(reference):

@@ -7,7 +7,8 @@ import pytest
 
 from headway import settings
 from headway.config import CollectionConfig, Config
-from headway.experiment.runs import EpisodeRow, RunDir
+from headway.experiment.runs import RunDir
+from headway.experiment.tables import EpisodeRow
 
 TRAIN = (0.5, 0.75, 1.0, 1.25)
 GROUPS = {"train": TRAIN, "low": (0.25, 0.375), "high": (1.5, 1.75)}
@@ -72,7 +73,7 @@ def write(path, *, iterations=5, evaluated=(4,), env="pendulum", members=5, head
     path.mkdir(parents=True, exist_ok=True)
     content = {"schema": 1, "config": settings.to_dict(config)}
     (path / "config.json").write_text(json.dumps(content))
-    run.write_metrics(metrics_rows(rng, iterations, evaluated))
+    run.append_metrics(metrics_rows(rng, iterations, evaluated))
     rows = [
         EpisodeRow(
             "tmcl", env, 0, i, group, physics(lengths[k % len(lengths)]), k, float(value), 200
@@ -81,9 +82,9 @@ def write(path, *, iterations=5, evaluated=(4,), env="pendulum", members=5, head
         for group, lengths in GROUPS.items()
         for k, value in enumerate(rng.normal(LEVELS[group], 150, 8))
     ]
-    run.write_evaluation(rows)
-    run.write_assignments(assignment_rows(rng, iterations, members, heads))
-    run.write_prediction_errors(
+    run.append_evaluation(rows)
+    run.append_assignments(assignment_rows(rng, iterations, members, heads))
+    run.append_prediction_errors(
         {
             "iteration": i,
             "group": group,

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from headway.errors import RunError
-from headway.experiment.runs import EpisodeRow
+from headway.experiment.tables import EpisodeRow
 from headway.report.dynamics import Changes, choose_views, collect_changes
 from headway.report.figures import save_run_figures
 from headway.report.obs_names import obs_names

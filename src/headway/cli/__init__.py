@@ -1,7 +1,7 @@
 """The command `headway`: parses, calls one library function, prints.
 
 Results go to stdout, progress and errors to stderr. Exit codes: 0 done, 1 an error of
-Headway's, 2 wrong usage, 130 interrupted.
+Headway's, 2 wrong usage, 130 interrupted, 143 terminated.
 """
 
 import os
@@ -12,6 +12,8 @@ from typing import NoReturn
 from headway import __version__
 from headway.cli.usage import UsageError, closest, one_line
 from headway.errors import HeadwayError
+
+TERMINATED = 143  # as a shell reports SIGTERM
 
 HELP = """\
 usage: headway COMMAND ... [--help]
@@ -56,9 +58,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         return _fail(_describe(error), 1)
     except KeyboardInterrupt:
-        advice = "; the same command goes on after the last finished iteration"
-        print(f"interrupted{advice if words[:1] == ['train'] else ''}", file=sys.stderr)
+        _say_stopped("interrupted", words)
         return _leave(130) if argv is None else 130
+    except SystemExit as stop:
+        if stop.code != TERMINATED:
+            raise
+        _say_stopped("terminated", words)
+        return _leave(TERMINATED) if argv is None else TERMINATED
 
 
 def _dispatch(words: list[str]) -> int:
@@ -84,6 +90,11 @@ def _describe(error: OSError) -> str:
     if error.filename is None:
         return str(error)
     return f"cannot use {error.filename}: {error.strerror}; check the path and its permissions."
+
+
+def _say_stopped(how: str, words: list[str]) -> None:
+    advice = "; the same command goes on where this one stopped"
+    print(f"{how}{advice if words[:1] == ['train'] else ''}", file=sys.stderr)
 
 
 def _leave(code: int) -> NoReturn:

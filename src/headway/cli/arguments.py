@@ -106,6 +106,10 @@ class Train:
     """A JSON file with the training and unseen physics."""
     env_options: Annotated[tuple[str, ...], _unset("those of the preset")] = ()
     """Switches of the environment: NAME or NAME=on turns one on, NAME=off turns it off."""
+    resume_from_last_good: Flag = False
+    """Where a file of the run is damaged, go back to the newest iteration that is intact."""
+    ignore_limits: Flag = False
+    """Try what seems too large for the free memory."""
     json: Flag = False
     """Print one JSON line on stdout instead of tables."""
     quiet: Flag = False

@@ -24,10 +24,11 @@ from headway.errors import ConfigError, unknown_name
 
 if TYPE_CHECKING:
     from headway.experiment.evaluation import PlanningCost
-    from headway.experiment.runs import EpisodeRow
+    from headway.experiment.tables import EpisodeRow
     from headway.tasks.catalog import EnvSpec
 
 PIPE_WIDTH = 130
+MAX_SIM_PARAMS_BYTES = 2**20
 
 
 def train(words: Sequence[str]) -> int:
@@ -44,6 +45,8 @@ def train(words: Sequence[str]) -> int:
         run_dir=arguments.run_dir,
         settings=settings,
         progress=make_progress(arguments.quiet),
+        resume_from_last_good=arguments.resume_from_last_good,
+        ignore_limits=arguments.ignore_limits,
     )
     last = max((row.iteration for row in run.evaluation), default=0)
     rows = [row for row in run.evaluation if row.iteration == last]
@@ -222,9 +225,11 @@ def _env_options(env: str, words: Sequence[str]) -> dict[str, bool]:
 
 def _read_sim_params(path: Path) -> dict[str, Any]:
     """Read a file of training and unseen physics; the library checks what it holds."""
+    from headway.experiment import files
+
     try:
-        return json.loads(path.read_text())
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        return files.parse_json(files.read_bytes(path, MAX_SIM_PARAMS_BYTES))
+    except ValueError as error:
         raise ConfigError(
             f"{path} is not JSON ({error}); write training and unseen sets."
         ) from None

@@ -102,7 +102,9 @@ class BlockedData:
         """Blocks that hold all trajectories."""
         return -(-len(self.trajectories) // self.layout.num_episodes)
 
-    def stream(self, epochs: int, key: PRNGKeyArray) -> Generator[Block, None, None]:
+    def stream(
+        self, epochs: int, key: PRNGKeyArray, *, first: int = 0
+    ) -> Generator[Block, None, None]:
         """The blocks of all epochs in a row, `num_blocks` in each epoch.
 
         Let go of a block before taking the next: then at most two exist at a time.
@@ -110,8 +112,9 @@ class BlockedData:
         Args:
             epochs: Passes over the data.
             key: Deals out the episodes and shuffles the samples.
+            first: Begin with this epoch, because those before it are done.
         """
-        keys = (jax.random.fold_in(key, epoch) for epoch in range(epochs))
+        keys = (jax.random.fold_in(key, epoch) for epoch in range(first, epochs))
         if self.num_blocks > 1:
             return made_ahead(self._block, (deal for key in keys for deal in self._deals(key)))
         data = self._lay_out(self.trajectories)

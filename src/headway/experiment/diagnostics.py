@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.data import Episodes, Trajectory
-from headway.experiment.runs import format_sim_params
+from headway.experiment.tables import format_sim_params
 from headway.models.fitting import FitSetup, assign_segments
 from headway.planning.agent import Agent, choose_heads, encode, planning_heads
 from headway.planning.heads import RecentTransitions

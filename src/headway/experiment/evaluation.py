@@ -1,6 +1,7 @@
 """Testing a controller on training and unseen physics (fact sheet D.2)."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 
 import jax
@@ -8,8 +9,10 @@ from jaxtyping import PRNGKeyArray
 
 from headway.config import Config
 from headway.data import Trajectory
-from headway.experiment.rollouts import Arena, Episode, PlannerUse, agent_policy, run_episodes
-from headway.experiment.runs import EpisodeRow
+from headway.experiment.progress_store import ProgressStore
+from headway.experiment.resumable import resumable_episodes
+from headway.experiment.rollouts import AgentPolicy, Arena, Episode, PlannerUse, run_episodes
+from headway.experiment.tables import EpisodeRow
 from headway.planning.agent import Agent
 from headway.planning.flop import plan_flop
 from headway.sim_params import SimParamSets
@@ -70,6 +73,7 @@ def evaluate_agent(
     *,
     key: PRNGKeyArray,
     on_step: Callable[[int], None] = lambda steps: None,
+    store: ProgressStore | None = None,
 ) -> tuple[dict[str, list[Trajectory]], PlannerUse]:
     """Run the test episodes of some groups, as many side by side as the batch holds.
 
@@ -80,6 +84,7 @@ def evaluate_agent(
         groups: `train` or unseen groups.
         key: The planner's draws.
         on_step: Called after each step with the number of environments that stepped.
+        store: Keeps what is done, for when the process is killed.
 
     Returns:
         The trajectories of each group, in the order of their episodes, and what planning them
@@ -97,8 +102,15 @@ def evaluate_agent(
     size, use = arena.vector.num_envs, PlannerUse()
     for chunk, start in enumerate(range(0, len(episodes), size)):
         batch = episodes[start : start + size]
-        policy = agent_policy(agent, size, key=jax.random.fold_in(key, chunk))
-        rollout = run_episodes(arena, [episode for _, episode in batch], policy, on_step)
+        chunk_key = jax.random.fold_in(key, chunk)
+        policy = functools.partial(AgentPolicy, agent, size, key=chunk_key)
+        side_by_side = [episode for _, episode in batch]
+        if store is None:
+            rollout = run_episodes(arena, side_by_side, policy(), on_step)
+        else:
+            rollout = resumable_episodes(
+                store, f"evaluate-{chunk}", arena, side_by_side, policy, on_step
+            )
         use += rollout.use
         for (group, _), trajectory in zip(batch, rollout.trajectories, strict=True):
             found[group].append(trajectory)

@@ -82,6 +82,8 @@ class Choice(NamedTuple):
     """Planner iterations that found nothing finite."""
     evaluations: Int[np.ndarray, " env"]
     """Candidates that the planner scored."""
+    timed: bool = True
+    """Whether choosing took as long as planning takes; not where an earlier choice is repeated."""
 
 
 class Policy(Protocol):
@@ -99,16 +101,17 @@ def random_policy(arena: Arena, rng: np.random.Generator) -> Policy:
     return lambda obs: Choice(rng.uniform(-1.0, 1.0, shape).astype(np.float32), none, none)
 
 
-def agent_policy(agent: Agent, num_envs: int, *, key: PRNGKeyArray) -> Policy:
-    """An agent that starts with an empty memory."""
-    state = agent.init(num_envs, key=key)
+class AgentPolicy:
+    """An agent and what it remembers of each environment; it starts with an empty memory."""
 
-    def act(obs):
-        nonlocal state
-        state, decision = agent.act(state, jnp.asarray(obs, jnp.float32))
+    def __init__(self, agent: Agent, num_envs: int, *, key: PRNGKeyArray):
+        self._agent = agent
+        self.state = agent.init(num_envs, key=key)
+
+    def __call__(self, obs: Float[np.ndarray, "env obs"]) -> Choice:
+        """See `Policy`."""
+        self.state, decision = self._agent.act(self.state, jnp.asarray(obs, jnp.float32))
         return Choice(*jax.device_get((decision.action, decision.failures, decision.evaluations)))
-
-    return act
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,7 +132,7 @@ class PlannerUse:
     @classmethod
     def of_step(cls, choice: Choice, running: Bool[np.ndarray, " env"]) -> "PlannerUse":
         """One step, in which only the first `len(running)` environments matter."""
-        failures, evaluations = (int(x[: len(running)][running].sum()) for x in choice[1:])
+        failures, evaluations = (int(x[: len(running)][running].sum()) for x in choice[1:3])
         return cls(int(running.sum()), failures, evaluations)
 
     def __add__(self, other: "PlannerUse") -> "PlannerUse":
@@ -178,7 +181,7 @@ def run_episodes(
         choice = policy(obs)
         seconds = time.perf_counter() - started
         use += PlannerUse.of_step(choice, running[:wanted])
-        if step:  # the first one may compile
+        if step and choice.timed:  # the first one may compile
             use += PlannerUse(timed_steps=len(filled), seconds=seconds)
         obs, reward, ends, cut, _ = arena.vector.step(env_action(arena.task, choice.action))
         observations.append(check(arena, obs, filled, "obs", step + 1))

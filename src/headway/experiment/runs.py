@@ -1,75 +1,46 @@
 """The run directory: configuration, metrics, tables, checkpoints, data, figures.
 
-An iteration is finished once its line stands in `metrics.jsonl`, which is written last.
-Whatever an interrupted iteration left behind is written again when the run goes on.
+An iteration is finished once its manifest stands in `manifests/`, which is written last and
+holds the checksum of every file the iteration stands on. Tables only grow; a manifest knows how
+much of them counts. Whatever an interrupted iteration left behind is written again.
 """
 
-import dataclasses
-import importlib.metadata
-import platform
-from collections.abc import Iterable, Mapping
+import contextlib
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
-
-import jax
 
 from headway import settings
 from headway.config import Config
 from headway.data import Trajectory
-from headway.errors import ConfigError, RunError
-from headway.experiment import storage
+from headway.errors import ConfigError, HeadwayError, RunError
+from headway.experiment import config_file, files, storage
+from headway.experiment.config_file import SCHEMA, UNCHECKED
+from headway.experiment.interrupts import StopRequest
+from headway.experiment.manifest import Digest, Manifest, inside
+from headway.experiment.progress_store import ProgressStore
+from headway.experiment.run_lock import LOCK, locked
+from headway.experiment.tables import (
+    ASSIGNMENT_COLUMNS,
+    EVALUATION_COLUMNS,
+    PREDICTION_COLUMNS,
+    EpisodeRow,
+    check_metrics,
+    parse_rows,
+    typed_row,
+)
 
-SCHEMA = 1
-VERSIONED = ("headway", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco")
-EVALUATION_COLUMNS = (
-    "method", "env", "seed", "iteration", "group", "sim_params", "episode", "return", "length",
-)  # fmt: skip
-ASSIGNMENT_COLUMNS = ("iteration", "member", "head", "sim_params", "share")
-PREDICTION_COLUMNS = ("iteration", "group", "step", "error")
-
-
-@dataclasses.dataclass(frozen=True)
-class EpisodeRow:
-    """One test episode; a row of `evaluation.csv`."""
-
-    method: str
-    env: str
-    seed: int
-    iteration: int
-    group: str
-    sim_params: Mapping[str, float]
-    episode: int
-    episode_return: float
-    length: int
-
-    def to_csv(self) -> dict[str, Any]:
-        """The row as it is written."""
-        values = dataclasses.asdict(self)
-        values["sim_params"] = format_sim_params(self.sim_params)
-        values["return"] = values.pop("episode_return")
-        return values
-
-    @classmethod
-    def from_csv(cls, row: Mapping[str, str]) -> "EpisodeRow":
-        """The row as it was written."""
-        return cls(
-            row["method"],
-            row["env"],
-            int(row["seed"]),
-            int(row["iteration"]),
-            row["group"],
-            parse_sim_params(row["sim_params"]),
-            int(row["episode"]),
-            float(row["return"]),
-            int(row["length"]),
-        )
+KEPT = 2  # checkpoints, so that there is one to go back to
+TABLES = ("metrics.jsonl", "evaluation.csv", "assignments.csv", "prediction_error.csv")
+PARTIAL = "partial"
 
 
 class RunDir:
     """Reads and writes one run directory.
 
     Args:
-        path: The directory; nothing is created before `create`.
+        path: The directory; nothing is created before `create_or_resume`.
     """
 
     def __init__(self, path: str | Path):
@@ -78,33 +49,51 @@ class RunDir:
     @property
     def figures(self) -> Path:
         """Where figures go."""
-        return self.path / "figures"
+        return inside(self.path, "figures")
 
-    def create_or_resume(self, config: Config) -> None:
-        """Begin a run here, or make sure that the run here is the same.
+    def partial(self, stop: StopRequest) -> ProgressStore:
+        """The finished parts of the iteration after the last finished one."""
+        numbers = self._manifest_numbers()
+        next_iteration = numbers[-1] + 1 if numbers else 0
+        names = ["config.json", *map(_manifest_name, numbers[-1:])]
+        origin = " ".join(Digest.of(inside(self.path, name)).sha256 for name in names)
+        return ProgressStore(inside(self.path, PARTIAL), next_iteration, origin, stop)
+
+    def locked(self) -> contextlib.AbstractContextManager[None]:
+        """Keep every other process from writing here; the directory is made if need be.
 
         Raises:
-            RunError: The directory holds something else, or a run with other settings.
+            RunError: Another process trains this run, or there is something else here.
         """
         if self.path.exists() and not self.path.is_dir():
             raise RunError(
                 f"{self.path} is a file, allowed: a directory; choose another --run-dir."
             )
-        found = self.path.iterdir() if self.path.exists() else ()
-        if all(path.name.endswith(storage.UNFINISHED) for path in found):
-            storage.write_json(self.path / "config.json", _config_file(config))
-            return
-        if not (self.path / "config.json").exists():
+        if not (self._is_new() or (self.path / "config.json").exists()):
             raise RunError(
                 f"{self.path} is not empty and holds no run, allowed: a new directory or one"
                 " made by `headway train`; choose another --run-dir."
             )
+        files.make_dir(self.path)
+        return locked(self.path)
+
+    def create_or_resume(self, config: Config) -> None:
+        """Begin a run here, or make sure that the run here is the same; call it when `locked`.
+
+        Raises:
+            RunError: The directory holds something else, or a run with other settings.
+        """
+        if self._is_new():
+            files.write_bytes(self.path / "config.json", config_file.content(config))
+            return
         found = settings.differences(self.config(), config)
         if found:
             raise RunError(
                 f"{self.path} holds a run with other settings ({'; '.join(found)}); choose"
                 " another --run-dir, or the same settings to resume."
             )
+        if self._schema == UNCHECKED:
+            self._migrate()
 
     def config(self) -> Config:
         """The settings of the run here.
@@ -112,18 +101,11 @@ class RunDir:
         Raises:
             RunError: There is no run here, or its configuration is damaged.
         """
-        if not self.path.is_dir():
-            raise RunError(f"{self.path} is not a directory, allowed: a run directory.")
-        values = storage.read_json(self.path / "config.json")
-        if not isinstance(values, dict) or values.get("schema") != SCHEMA:
-            raise RunError(
-                f"{self.path / 'config.json'} has no schema {SCHEMA}, allowed: a file written by"
-                " this version of headway; train the run again."
-            )
+        values = self._config_values()
         try:
             return settings.from_dict(values["config"])
         except (ConfigError, KeyError) as error:
-            raise RunError(f"{self.path / 'config.json'} is damaged: {error}") from None
+            raise files.damaged(self.path / "config.json", error) from None
 
     @property
     def finished_iterations(self) -> int:
@@ -131,71 +113,85 @@ class RunDir:
         return len(self.metrics())
 
     def check(self) -> None:
-        """Read every table once, so that damage is found before work is done.
+        """Read everything once, so that damage is found before work is done.
 
         Raises:
-            RunError: A table is damaged, or the metrics of finished iterations are gone.
+            RunError: A file is damaged or gone; the message says how to go back.
         """
+        manifest = self.manifest()
+        if manifest is not None:
+            with self._advice():
+                manifest.check(self.path)
         self.evaluation()
         self.assignments()
         self.prediction_errors()
-        beyond = self.checkpoint(self.finished_iterations + 1)
-        if beyond.exists():
+        finished = self.finished_iterations
+        beyond = [path for path in self._iteration_files("checkpoints") if _number(path) > finished]
+        if beyond:
+            place = "manifests" if self._schema == SCHEMA else "metrics.jsonl"
             raise RunError(
-                f"{self.path / 'metrics.jsonl'} holds {self.finished_iterations} iterations, but"
-                f" {beyond.name} exists; restore the metrics or delete the run."
+                f"{self.path / place} holds {finished} iterations, but {beyond[-1].name} exists;"
+                f" restore {place} or delete the run."
             )
 
     def metrics(self) -> list[dict[str, Any]]:
-        """One entry per finished iteration."""
+        """One entry per finished iteration.
+
+        Raises:
+            RunError: The file is damaged.
+        """
         path = self.path / "metrics.jsonl"
-        rows = storage.read_json_lines(path)
-        for index, row in enumerate(rows):
-            if not isinstance(row, dict) or row.get("iteration") != index:
-                raise RunError(
-                    f"{path} is damaged in line {index + 1}, allowed: iteration {index}; restore it"
-                    " or delete the run."
-                )
+        rows = check_metrics(path, storage.parse_json_lines(path, self._text("metrics.jsonl")))
+        manifest = self.manifest()
+        if manifest is not None and manifest.iteration + 1 != len(rows):
+            raise files.damaged(path, f"the manifest ends with iteration {manifest.iteration}")
         return rows
 
     def evaluation(self) -> list[EpisodeRow]:
         """Every test episode of the finished iterations."""
-        path = self.path / "evaluation.csv"
-        try:
-            rows = [EpisodeRow.from_csv(row) for row in storage.read_csv(path, EVALUATION_COLUMNS)]
-        except ValueError as error:
-            raise RunError(f"{path} is damaged ({error}); restore it or delete the run.") from None
-        finished = self.finished_iterations
-        return [row for row in rows if row.iteration < finished]
+        return self._table("evaluation.csv", EVALUATION_COLUMNS, EpisodeRow.from_csv)
 
     def assignments(self) -> list[dict[str, Any]]:
         """Share of segments that each head owns, per iteration, member and physics."""
-        return self._table("assignments.csv", ASSIGNMENT_COLUMNS)
+        return self._table("assignments.csv", ASSIGNMENT_COLUMNS, typed_row)
 
     def prediction_errors(self) -> list[dict[str, Any]]:
         """Error by imagined step, per iteration and group."""
-        return self._table("prediction_error.csv", PREDICTION_COLUMNS)
+        return self._table("prediction_error.csv", PREDICTION_COLUMNS, typed_row)
 
-    def write_evaluation(self, rows: Iterable[EpisodeRow]) -> None:
-        """Replace the table of test episodes."""
-        table = (row.to_csv() for row in rows)
-        storage.write_csv(self.path / "evaluation.csv", EVALUATION_COLUMNS, table)
+    def append_evaluation(self, rows: Iterable[EpisodeRow]) -> None:
+        """Add test episodes behind those of the finished iterations."""
+        self._append("evaluation.csv", EVALUATION_COLUMNS, [row.to_csv() for row in rows])
 
-    def write_assignments(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Replace the table of head shares."""
-        storage.write_csv(self.path / "assignments.csv", ASSIGNMENT_COLUMNS, rows)
+    def append_assignments(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Add head shares behind those of the finished iterations."""
+        self._append("assignments.csv", ASSIGNMENT_COLUMNS, rows)
 
-    def write_prediction_errors(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Replace the table of prediction errors."""
-        storage.write_csv(self.path / "prediction_error.csv", PREDICTION_COLUMNS, rows)
+    def append_prediction_errors(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Add prediction errors behind those of the finished iterations."""
+        self._append("prediction_error.csv", PREDICTION_COLUMNS, rows)
 
-    def write_metrics(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        """Replace the metrics; what they hold counts as finished."""
-        storage.write_json_lines(self.path / "metrics.jsonl", rows)
+    def append_metrics(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        """Add metrics behind those of the finished iterations."""
+        path = inside(self.path, "metrics.jsonl")
+        lines = storage.json_lines(path, rows)
+        files.write_bytes(path, self._text("metrics.jsonl") + lines.encode())
 
     def checkpoint(self, iteration: int) -> Path:
         """The file with the networks, optimiser and statistics after an iteration."""
-        return self.path / "checkpoints" / f"iteration-{iteration:03d}.safetensors"
+        return inside(self.path, _checkpoint_name(iteration))
+
+    def checked_checkpoint(self, iteration: int) -> Path:
+        """The same file, which is as it was written.
+
+        Raises:
+            RunError: It is not; the message says how to go back.
+        """
+        manifest = self.manifest()
+        if manifest is not None:
+            with self._advice():
+                manifest.check(self.path, ["config.json", _checkpoint_name(iteration)])
+        return self.checkpoint(iteration)
 
     def save_data(self, iteration: int, trajectories: list[Trajectory]) -> None:
         """Keep what an iteration collected."""
@@ -209,54 +205,181 @@ class RunDir:
         """All trajectories of the finished iterations, memory-mapped."""
         return [t for i in range(self.finished_iterations) for t in self.iteration_data(i)]
 
-    def _data(self, iteration: int) -> Path:
-        return self.path / "data" / f"iteration-{iteration:03d}"
+    def finish(self, iteration: int) -> None:
+        """Make an iteration count, once all its files are written."""
+        previous = self.manifest()
+        known = {} if previous is None else previous.files
+        old = {name: digest for name, digest in known.items() if name.startswith("data/")}
+        new = self._digests(iteration, range(iteration, iteration + 1))
+        Manifest(iteration, {**old, **new}).write(self._manifest_path(iteration))
+        self.tidy()
 
-    def _table(self, name: str, columns: tuple[str, ...]) -> list[dict[str, Any]]:
-        """Read a table whose columns are numbers, but for `group` and `sim_params`."""
-        texts = ("group", "sim_params")
-        wholes = ("iteration", "member", "head", "step")
-        rows = storage.read_csv(self.path / name, columns)
-        try:
-            typed = [
-                {
-                    column: value
-                    if column in texts
-                    else (int if column in wholes else float)(value)
-                    for column, value in row.items()
-                }
-                for row in rows
-            ]
-        except ValueError as error:
-            raise RunError(f"{self.path / name} is damaged ({error}); delete it.") from None
+    def manifest(self) -> Manifest | None:
+        """What the newest finished iteration stands on; None before the first, and in schema 1.
+
+        Raises:
+            RunError: It is damaged; the message says how to go back.
+        """
+        numbers = self._manifest_numbers()
+        if not numbers or self._schema == UNCHECKED:
+            return None
+        with self._advice():
+            return self._read_manifest(numbers[-1])
+
+    def last_good(self) -> int | None:
+        """The newest finished iteration whose files are all as they were written."""
+        for iteration in reversed(self._manifest_numbers()):
+            with contextlib.suppress(HeadwayError):
+                self._read_manifest(iteration).check(self.path)
+                return iteration
+        return None
+
+    def go_back(self) -> int | None:
+        """Forget the iterations after the last good one; call it when `locked`.
+
+        Returns:
+            The last good iteration; None when none was finished yet.
+
+        Raises:
+            RunError: No finished iteration is intact.
+        """
+        numbers = self._manifest_numbers()
+        good = self.last_good()
+        if good is None and numbers:
+            raise RunError(
+                f"{self.path} has no intact iteration to go back to; restore it from a copy, or"
+                " start anew in another directory."
+            )
+        newer = [number for number in reversed(numbers) if good is not None and number > good]
+        files.remove(self._manifest_path(number) for number in newer)
+        return good
+
+    def tidy(self) -> None:
+        """Delete what is of no use any more: older checkpoints, unfinished files."""
+        numbers = self._manifest_numbers()
+        if numbers:
+            kept = range(numbers[-1] - KEPT + 1, numbers[-1] + 2)
+            for folder in ("manifests", "checkpoints"):
+                found = self._iteration_files(folder)
+                files.remove(path for path in found if _number(path) not in kept)
+        for folder in [self.path, *(inside(self.path, name) for name in _FOLDERS)]:
+            files.remove(list(folder.glob(f".*{files.UNFINISHED}")))
+
+    def _is_new(self) -> bool:
+        found = self.path.iterdir() if self.path.exists() else ()
+        return all(path.name.endswith(files.UNFINISHED) or path.name == LOCK for path in found)
+
+    def _config_values(self) -> dict[str, Any]:
+        if not self.path.is_dir():
+            raise RunError(f"{self.path} is not a directory, allowed: a run directory.")
+        return config_file.read(inside(self.path, "config.json"))
+
+    @property
+    def _schema(self) -> int:
+        return self._config_values()["schema"]
+
+    def _migrate(self) -> None:
+        """Give a run of schema 1 a manifest, then the present schema."""
+        self.check()
         finished = self.finished_iterations
-        return [row for row in typed if int(row["iteration"]) < finished]
+        content = files.seal({**self._config_values(), "schema": SCHEMA})
+        if finished:
+            # Rows of an unfinished iteration are left behind.
+            episodes = [row.to_csv() for row in self.evaluation()]
+            self._write_table("evaluation.csv", EVALUATION_COLUMNS, episodes)
+            self._write_table("assignments.csv", ASSIGNMENT_COLUMNS, self.assignments())
+            self._write_table("prediction_error.csv", PREDICTION_COLUMNS, self.prediction_errors())
+            digests = self._digests(finished - 1, range(finished))
+            digests["config.json"] = Digest.of_bytes(content)
+            Manifest(finished - 1, digests).write(self._manifest_path(finished - 1))
+        files.write_bytes(self.path / "config.json", content)
+
+    def _digests(self, iteration: int, data: range) -> dict[str, Digest]:
+        """The files of an iteration as they are now, with the data of some iterations."""
+        found = [path for path in self._iteration_files("data") if _number(path) in data]
+        names = ["config.json", *TABLES, _checkpoint_name(iteration)]
+        names += [path.relative_to(self.path).as_posix() for path in found]
+        return {name: Digest.of(inside(self.path, name)) for name in names}
+
+    def _iteration_files(self, folder: str) -> list[Path]:
+        """The files of a folder that belong to an iteration, by its number."""
+        found = inside(self.path, folder).glob("iteration-*")
+        return sorted((path for path in found if _number(path) >= 0), key=_number)
+
+    def _text(self, name: str) -> bytes:
+        """The part of a table that belongs to finished iterations; all of it in schema 1."""
+        manifest = self.manifest()
+        if manifest is not None:
+            with self._advice():
+                return manifest.read_text(self.path, name)
+        path = inside(self.path, name)
+        return files.read_bytes(path) if self._schema == UNCHECKED and path.exists() else b""
+
+    def _table(self, name: str, columns: tuple[str, ...], parse: Any) -> list[Any]:
+        rows = storage.parse_csv(self.path / name, self._text(name), columns)
+        if self._schema == UNCHECKED:
+            finished = self.finished_iterations
+            rows = (row for row in rows if int(row["iteration"]) < finished)
+        return parse_rows(self.path / name, rows, parse)
+
+    def _append(
+        self, name: str, columns: tuple[str, ...], rows: Iterable[Mapping[str, Any]]
+    ) -> None:
+        before = self._text(name)
+        lines = storage.csv_lines(columns, rows, header=not before)
+        files.write_bytes(inside(self.path, name), before + lines.encode())
+
+    def _write_table(
+        self, name: str, columns: tuple[str, ...], rows: Iterable[Mapping[str, Any]]
+    ) -> None:
+        lines = storage.csv_lines(columns, rows, header=True)
+        files.write_bytes(inside(self.path, name), lines.encode())
+
+    def _data(self, iteration: int) -> Path:
+        return inside(self.path, f"data/iteration-{iteration:03d}")
+
+    def _manifest_path(self, iteration: int) -> Path:
+        return inside(self.path, _manifest_name(iteration))
+
+    def _manifest_numbers(self) -> list[int]:
+        return list(map(_number, self._iteration_files("manifests")))
+
+    def _read_manifest(self, iteration: int) -> Manifest:
+        path = self._manifest_path(iteration)
+        manifest = Manifest.read(path)
+        if manifest.iteration != iteration:
+            raise files.damaged(path, f"it is of iteration {manifest.iteration}")
+        return manifest
+
+    @contextlib.contextmanager
+    def _advice(self) -> Iterator[None]:
+        """Add to an error how to go back."""
+        try:
+            yield
+        except RunError as error:
+            good = self.last_good()
+            advice = (
+                "No earlier iteration is intact; restore the file, or start anew in another"
+                " directory."
+                if good is None
+                else f"The last good iteration is {good}: the run's `headway train` command with"
+                " --resume-from-last-good goes back to it."
+            )
+            raise RunError(f"{error} {advice}") from None
 
 
-def format_sim_params(sim_params: Mapping[str, float]) -> str:
-    """Write simulator parameters as one cell, for example `length=0.5 mass=1`."""
-    return " ".join(f"{name}={value:.12g}" for name, value in sorted(sim_params.items()))
+_FOLDERS = ("checkpoints", "data", "manifests", PARTIAL, "figures", "tensorboard")
 
 
-def parse_sim_params(text: str) -> dict[str, float]:
-    """Read what `format_sim_params` wrote.
-
-    Raises:
-        ValueError: The text is not of that form.
-    """
-    pairs = [part.split("=") for part in text.split()]
-    if any(len(pair) != 2 for pair in pairs):
-        raise ValueError(f"{text!r} is not of the form name=value")
-    return {name: float(value) for name, value in pairs}
+def _checkpoint_name(iteration: int) -> str:
+    return f"checkpoints/iteration-{iteration:03d}.safetensors"
 
 
-def _config_file(config: Config) -> dict[str, Any]:
-    return {
-        "schema": SCHEMA,
-        "config": settings.to_dict(config),
-        "versions": {
-            "python": platform.python_version(),
-            **{name: importlib.metadata.version(name) for name in VERSIONED},
-        },
-        "device": str(jax.devices()[0].device_kind),
-    }
+def _manifest_name(iteration: int) -> str:
+    return f"manifests/iteration-{iteration:03d}.json"
+
+
+def _number(path: Path) -> int:
+    """The iteration that a file belongs to; -1 for a file that is not ours."""
+    found = re.fullmatch(r"iteration-(\d{3,9})\.\w+", path.name)
+    return int(found[1]) if found else -1

@@ -1,8 +1,8 @@
 """The training loop: collect, fit, evaluate, save, and again (supplement A.2; fact sheet D)."""
 
 import dataclasses
+import functools
 import itertools
-import time
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,21 +15,32 @@ from jaxtyping import PRNGKeyArray
 from headway.config import Config
 from headway.data import ReplayBuffer, Trajectory
 from headway.errors import DivergenceError, RunError
-from headway.experiment import storage
+from headway.experiment import arrays
 from headway.experiment.blocks import BlockedData, Layout, fit_blocks
 from headway.experiment.diagnostics import head_shares, prediction_error
 from headway.experiment.evaluation import episode_rows, evaluate_agent
+from headway.experiment.interrupts import StopRequest, stop_requests
+from headway.experiment.limits import MemoryNeed, check_memory, memory_need
 from headway.experiment.methods import check_block, check_options
 from headway.experiment.progress import Progress
+from headway.experiment.progress_store import ProgressStore
+from headway.experiment.resumable import (
+    fit_part,
+    fitted_before,
+    resumable_episodes,
+    take_up,
+    went_back,
+)
 from headway.experiment.rollouts import (
+    AgentPolicy,
     Arena,
     Episode,
     PlannerUse,
-    agent_policy,
+    Policy,
     random_policy,
-    run_episodes,
 )
 from headway.experiment.runs import RunDir
+from headway.experiment.tensorboard import write_tensorboard
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import EpochStats, FitSetup, FitState
 from headway.planning.agent import Agent
@@ -70,28 +81,30 @@ class Trainer:
     learned: Learned
     buffer: ReplayBuffer
     progress: Progress
+    stop: StopRequest
+    store: ProgressStore = dataclasses.field(init=False)
+    """Keeps what is done of the unfinished iteration."""
 
     @classmethod
-    def open(cls, config: Config, run: RunDir, progress: Progress) -> "Trainer":
-        """Begin a run, or go on with the one in the directory.
+    def open(cls, config: Config, run: RunDir, progress: Progress, stop: StopRequest) -> "Trainer":
+        """Begin a run, or go on with the one in the directory, which is locked.
 
         Raises:
-            ConfigError: The settings do not fit the environment.
             RunError: The directory holds another run, or a damaged one.
             BadEnvironmentError: The environment does not fit its Task.
         """
-        check_block(config)
         arena = Arena.make(config)
         layout = Layout.of(config, arena.episode_length)
         run.create_or_resume(config)
         run.check()
+        run.tidy()
         setup = FitSetup(arena.task, config.fitting, config.model.history_length)
         buffer = ReplayBuffer(arena.task.obs_size, arena.task.action_size)
         for trajectory in run.load_data():
             buffer.add(trajectory)
         finished = run.finished_iterations
         learned = initial(config, arena.task) if finished == 0 else load_learned(run, config)
-        return cls(config, run, arena, layout, setup, learned, buffer, progress)
+        return cls(config, run, arena, layout, setup, learned, buffer, progress, stop)
 
     @property
     def agent(self) -> Agent:
@@ -125,14 +138,15 @@ class Trainer:
 
     def run_iteration(self, iteration: int) -> None:
         """Collect, fit, evaluate and save; only the last write makes it count."""
+        self.store = self.run.partial(self.stop)
+        take_up(self.store, self.progress)
         keys = Keys.of(self.config.seed, iteration)
-        clock = [time.perf_counter()]
-        collected, failures = self.collect(iteration, keys.collect)
-        clock.append(time.perf_counter())
-        fitting = self.fit(iteration, keys.fit)
-        clock.append(time.perf_counter())
-        tested, test_use = self.evaluate(iteration, keys.evaluate)
-        clock.append(time.perf_counter())
+        with self.store.timing("collect"):
+            collected, failures = self.collect(iteration, keys.collect)
+        with self.store.timing("fit"):
+            fitting = self.fit(iteration, keys.fit)
+        with self.store.timing("evaluate"):
+            tested, test_use = self.evaluate(iteration, keys.evaluate)
         metrics = {
             "iteration": iteration,
             "timesteps": self.buffer.num_transitions,
@@ -140,10 +154,7 @@ class Trainer:
             "fitting": fitting,
             "evaluation": {group: _summary(found) for group, found in tested.items()},
             "test_planner_failures": test_use.failures,
-            "seconds": {
-                name: round(clock[i + 1] - clock[i], 3)
-                for i, name in enumerate(("collect", "fit", "evaluate"))
-            },
+            "seconds": self.store.seconds,
         }
         self.save(iteration, tested, metrics, keys.diagnose)
         self.progress.iteration_done(metrics)
@@ -155,12 +166,15 @@ class Trainer:
         num_episodes = config.collection.num_episodes
         seeds = rng.integers(2**31 - 1, size=num_episodes)
         episodes = [Episode(arena.sim_params.sample(rng), int(seed)) for seed in seeds]
-        if iteration == 0:
-            policy = random_policy(arena, rng)
-        else:
-            policy = agent_policy(self.agent, num_episodes, key=key)
+
+        def policy() -> Policy:
+            if iteration == 0:
+                return random_policy(arena, rng)
+            return AgentPolicy(self.agent, num_episodes, key=key)
+
         self.phase(iteration, "collect")
-        rollout = run_episodes(arena, episodes, policy, self.progress.advance)
+        advance = self.progress.advance
+        rollout = resumable_episodes(self.store, "collect", arena, episodes, policy, advance)
         return self.keep(iteration, rollout.trajectories), rollout.use.failures
 
     def keep(self, iteration: int, collected: list[Trajectory]) -> list[Trajectory]:
@@ -186,14 +200,17 @@ class Trainer:
             or self.config.model.num_heads == 1
         )
         self.phase(iteration, "fit")
-        state, history = self.learned.fit, []
-        with closing(data.stream(fitting.epochs, epoch_key)) as blocks:
-            for epoch in range(fitting.epochs):
+        state, history = fitted_before(self.store, self.learned.fit)
+        self.progress.advance(len(history))
+        done = len(history)
+        with closing(data.stream(fitting.epochs, epoch_key, first=done)) as blocks:
+            for epoch in range(done, fitting.epochs):
                 of_epoch = itertools.islice(blocks, data.num_blocks)
                 state, stats = fit_blocks(state, self.setup, of_epoch, independent=independent)
                 check_epoch(stats, iteration, epoch)
                 self.progress.advance(1, loss=float(stats.loss))
                 history.append(stats)
+                self.store.offer("fit", functools.partial(fit_part, state, list(history)))
         self.learned = Learned(state, data.statistics)
         return {
             "loss": float(history[-1].loss),
@@ -219,8 +236,15 @@ class Trainer:
         if not groups:
             return {}, PlannerUse()
         self.phase(iteration, "evaluate")
-        advance = self.progress.advance
-        return evaluate_agent(self.agent, self.arena, self.config, groups, key=key, on_step=advance)
+        return evaluate_agent(
+            self.agent,
+            self.arena,
+            self.config,
+            groups,
+            key=key,
+            on_step=self.progress.advance,
+            store=self.store,
+        )
 
     def save(
         self,
@@ -231,39 +255,69 @@ class Trainer:
     ) -> None:
         """Write everything of a finished iteration; the metrics come last."""
         run, config = self.run, self.config
-        storage.save_tree(run.checkpoint(iteration), self.learned)
-        run.write_evaluation(run.evaluation() + episode_rows(config, iteration, tested))
+        arrays.save_tree(run.checkpoint(iteration), self.learned)
+        run.append_evaluation(episode_rows(config, iteration, tested))
         blocks = self.layout.in_order(self.buffer.trajectories)
         shares = head_shares(self.agent, self.setup, blocks)
-        numbered = [{"iteration": iteration, **row} for row in shares]
-        run.write_assignments(run.assignments() + numbered)
+        run.append_assignments([{"iteration": iteration, **row} for row in shares])
         errors = [
             {"iteration": iteration, "group": group, "step": step + 1, "error": float(error)}
             for group, found in tested.items()
             for step, error in enumerate(prediction_error(self.agent, found, key=key))
         ]
-        run.write_prediction_errors(run.prediction_errors() + errors)
-        run.write_metrics([*run.metrics(), metrics])
+        run.append_prediction_errors(errors)
+        run.append_metrics([metrics])
         write_tensorboard(run.path, metrics)
-        run.checkpoint(iteration - 2).unlink(missing_ok=True)
+        run.finish(iteration)
+        self.store.clear()
 
 
-def train_run(config: Config, run_dir: str | Path, progress: Progress | None = None) -> RunDir:
+def train_run(
+    config: Config,
+    run_dir: str | Path,
+    progress: Progress | None = None,
+    *,
+    resume_from_last_good: bool = False,
+    ignore_limits: bool = False,
+) -> RunDir:
     """Train until the last iteration, from wherever the run stands.
+
+    Ctrl-C and SIGTERM save what is done and stop. Only one process trains in a directory.
 
     Args:
         config: All settings.
         run_dir: A new directory, or one with the same settings.
         progress: Shown while training; silent by default.
+        resume_from_last_good: Where a file is damaged, forget the iterations that stand on it.
+        ignore_limits: Try what seems too large for the free memory.
+
+    Raises:
+        ConfigError: The settings do not fit the environment.
+        LimitError: The run needs more memory than is free.
+        RunError: The directory holds something else, is damaged, or in use.
     """
-    with progress or Progress() as shown:
-        trainer = Trainer.open(config, RunDir(run_dir), shown)
-        todo = range(trainer.run.finished_iterations, config.collection.num_iterations)
+    check_block(config)
+    run = RunDir(run_dir)
+    if not ignore_limits:
+        check_memory(need_of(config))
+    with progress or Progress() as shown, run.locked(), stop_requests() as stop:
+        if resume_from_last_good:
+            shown.message(went_back(run.go_back()))
+        trainer = Trainer.open(config, run, shown, stop)
+        todo = range(run.finished_iterations, config.collection.num_iterations)
         work = [(i, trainer.amount_of_work(i)) for i in todo]
         shown.schedule([(i, name, total) for i, amounts in work for name, total in amounts.items()])
         for iteration in todo:
             trainer.run_iteration(iteration)
-    return trainer.run
+            stop.answer()
+        run.partial(stop).clear()
+    return run
+
+
+def need_of(config: Config) -> MemoryNeed:
+    """The memory that training a configuration needs."""
+    length = config.collection.episode_length or env_spec(config.env).episode_length
+    return memory_need(config, load_task(config), length)
 
 
 def check_epoch(stats: EpochStats, iteration: int, epoch: int) -> None:
@@ -307,8 +361,9 @@ def load_learned(run: RunDir, config: Config) -> Learned:
             " `headway train` command."
         )
     task = load_task(config)
+    check_memory(need_of(config).to_load)
     template = eqx.filter_eval_shape(lambda: initial(config, task))
-    return storage.load_tree(run.checkpoint(finished - 1), template)
+    return arrays.load_tree(run.checked_checkpoint(finished - 1), template)
 
 
 def load_agent(run: RunDir, config: Config | None = None) -> Agent:
@@ -330,19 +385,6 @@ def load_task(config: Config) -> Task:
     check_options(config)
     spec = env_spec(config.env)
     return spec.make_task(**{**spec.options, **config.env_options})
-
-
-def write_tensorboard(path: Path, metrics: dict[str, Any]) -> None:
-    """Add one iteration's numbers to the TensorBoard log, over environment steps."""
-    from tensorboardX import SummaryWriter
-
-    suffix = f".{metrics['iteration']:03d}"
-    with SummaryWriter(str(path / "tensorboard"), filename_suffix=suffix) as writer:
-        for section in ("collection", "fitting", "evaluation", "seconds"):
-            for name, value in metrics[section].items():
-                number = value["return_mean"] if isinstance(value, dict) else value
-                if isinstance(number, int | float):
-                    writer.add_scalar(f"{section}/{name}", number, metrics["timesteps"])
 
 
 def _summary(trajectories: list[Trajectory]) -> dict[str, Any]:

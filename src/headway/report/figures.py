@@ -11,7 +11,8 @@ from matplotlib.ticker import MaxNLocator
 
 from headway.config import Config
 from headway.experiment.references import score
-from headway.experiment.runs import EpisodeRow, RunDir, parse_sim_params
+from headway.experiment.runs import RunDir
+from headway.experiment.tables import EpisodeRow, parse_sim_params
 from headway.report.physics import axis_label, distinct, value_label, varying
 from headway.report.style import (
     FAINT,

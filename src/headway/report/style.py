@@ -5,6 +5,7 @@ own matplotlib settings are put back as soon as a figure is done.
 """
 
 import contextlib
+import io
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,6 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from headway.experiment import files
 
 INK = "#222222"
 FAINT = "#7a7a7a"
@@ -93,10 +96,9 @@ def figure(path: Path, *, title: str, caption: str, size: tuple[float, float]) -
         below = {"va": "bottom", "fontsize": 7.5, "color": FAINT, "linespacing": 1.35}
         drawing.text(left, 0.6 * _MARGIN / height, "\n".join(lines), **below)
         yield drawing
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.writing")
-        drawing.savefig(temporary, format="png", dpi=DPI)
-        temporary.replace(path)
+        image = io.BytesIO()
+        drawing.savefig(image, format="png", dpi=DPI)
+        files.write_bytes(path, image.getvalue())
 
 
 def legend(drawing: Figure, handles: Sequence[Any] | None = None) -> None:

@@ -1,0 +1,224 @@
+"""Memory: what a run will need, and what the machine has free, compared before it starts."""
+
+import itertools
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+
+from headway.config import Config
+from headway.errors import LimitError
+from headway.experiment.blocks import Layout
+from headway.tasks.base import Task
+
+PROCESS = 650 * 2**20  # Python, JAX, a simulator and compiled code, measured
+FLOAT = 4  # bytes
+MEMINFO = Path("/proc/meminfo")
+CGROUP = Path("/proc/self/cgroup")
+CGROUP_ROOT = Path("/sys/fs/cgroup")
+STATM = Path("/proc/self/statm")
+PAGE = 4096
+
+
+class MemoryNeed(NamedTuple):
+    """Bytes that a run needs at its peak, within a factor of 2."""
+
+    process: int
+    """Before any array."""
+    model: int
+    """Weights and Adam's moments, with the copies that an update and a checkpoint make."""
+    data: int
+    """The blocks that are laid out at a time, and their tables of samples."""
+    fitting: int
+    """Shuffled samples of an epoch and the activations of a batch."""
+    planning: int
+    """Imagined rollouts of all candidates."""
+
+    @property
+    def total(self) -> int:
+        """Fitting and planning are never at the same time."""
+        return self.process + self.model + self.data + max(self.fitting, self.planning)
+
+    @property
+    def to_load(self) -> "MemoryNeed":
+        """What is needed when the model is only read."""
+        return self._replace(process=0, data=0, fitting=0, planning=0)
+
+    @property
+    def to_test(self) -> "MemoryNeed":
+        """What is needed when nothing is fitted."""
+        return self._replace(data=0, fitting=0)
+
+
+def memory_need(config: Config, task: Task, episode_length: int) -> MemoryNeed:
+    """Estimate a run's memory from its settings alone; nothing is allocated.
+
+    Args:
+        config: All settings.
+        task: For the sizes of observations and actions.
+        episode_length: Steps of an episode.
+    """
+    collection, layout = config.collection, Layout.of(config, episode_length)
+    one_block = collection.num_iterations * collection.num_episodes <= layout.num_episodes
+    # Of several blocks, the next one is laid out while the device learns from the current one.
+    steps = layout.num_episodes * episode_length * (1 if one_block else 2)
+    samples = steps * config.fitting.future_length
+    members = config.model.num_members
+    step = task.obs_size + task.action_size
+    # In mapped files, laid out in NumPy and once more on the device.
+    episodes = steps * (3 * step * FLOAT + 8)
+    # Number of the episode, anchor and offset: in rows, as a table, padded, on the device.
+    table = samples * 4 * 3 * FLOAT
+    rows = members * samples * FLOAT
+    return MemoryNeed(
+        PROCESS,
+        16 * FLOAT * num_parameters(config, task),
+        episodes + table + rows,
+        6 * rows + _batch(config, task) + _assignment(config, task, episode_length),
+        _planning(config, task),
+    )
+
+
+def num_parameters(config: Config, task: Task) -> int:
+    """Weights of the whole ensemble, to a few percent."""
+    model = config.model
+    features = 2 * task.obs_size + task.action_size
+    hidden = _dense((features, *model.hidden_sizes))
+    outputs = (model.hidden_sizes[-1] + model.context_size + 1) * task.obs_size
+    heads = model.num_heads * outputs * (1 if model.deterministic else 2)
+    nets = (2 if model.backward_net else 1) * (hidden + heads)
+    if model.context_size:
+        history = model.history_length * (task.obs_size + task.action_size)
+        nets += _dense((history, *model.context_hidden_sizes, model.context_size))
+    return model.num_members * nets
+
+
+def _dense(sizes: tuple[int, ...]) -> int:
+    return sum((n + 1) * m for n, m in itertools.pairwise(sizes))
+
+
+def _batch(config: Config, task: Task) -> int:
+    """Activations of one update, kept for the gradient."""
+    model = config.model
+    heads = 2 * model.num_heads * (model.hidden_sizes[-1] + 3 * task.obs_size)
+    widths = 3 * (sum(model.hidden_sizes) + sum(model.context_hidden_sizes)) + heads
+    nets = 2 if model.backward_net else 1
+    return FLOAT * nets * model.num_members * config.fitting.batch_size * widths
+
+
+def _assignment(config: Config, task: Task, episode_length: int) -> int:
+    """Losses of every head on one episode."""
+    model = config.model
+    widths = 3 * max(model.hidden_sizes) + 6 * model.num_heads * task.obs_size
+    return FLOAT * model.num_members * episode_length * widths
+
+
+def _planning(config: Config, task: Task) -> int:
+    """One imagined step of every particle, and the candidates."""
+    planner, envs = config.planner, config.collection.num_episodes
+    particles = envs * planner.num_candidates * planner.num_particles
+    widest = 2 * max(config.model.hidden_sizes) + 8 * task.obs_size + 4 * task.action_size
+    candidates = envs * planner.num_candidates * planner.horizon * task.action_size
+    return FLOAT * (particles * widest + 4 * candidates)
+
+
+def check_memory(need: MemoryNeed) -> None:
+    """Refuse what does not fit, before the system's killer does.
+
+    Raises:
+        LimitError: The estimate is above what is free on the machine or on its accelerator.
+    """
+    device = jax.local_devices()[0]
+    on_host = need
+    if device.platform != "cpu":
+        on_host = need._replace(model=0, fitting=0, planning=0)
+        stats = device.memory_stats() or {}
+        limit, used = stats.get("bytes_limit"), stats.get("bytes_in_use", 0)
+        _compare(need._replace(process=0), limit and limit - used, f"on {device.device_kind}")
+    free = free_memory()
+    _compare(on_host, free if free is None else free + resident(), "on this machine")
+
+
+def _compare(need: MemoryNeed, free: int | None, where: str) -> None:
+    if free is None or need.total <= free:
+        return
+    parts = ", ".join(f"{name} {gib(value)}" for name, value in need._asdict().items() if value)
+    raise LimitError(
+        f"this run needs about {gib(need.total)} GiB of memory ({parts}), {gib(free)} GiB is free"
+        f" {where}; choose smaller sizes, or pass --ignore-limits (ignore_limits=True) to try all"
+        " the same."
+    )
+
+
+def gib(num_bytes: int) -> str:
+    """Word a size."""
+    return f"{num_bytes / 2**30:.3g}" if num_bytes < 2**70 else "over 10^12"
+
+
+def resident() -> int:
+    """Bytes that this process holds already."""
+    try:
+        return int(STATM.read_text().split()[1]) * PAGE
+    except (OSError, ValueError, IndexError):
+        return 0
+
+
+def free_memory() -> int | None:
+    """Bytes that can still be had, by the machine and by the control group; None if unknown."""
+    found = [value for value in (_available(), *_cgroup_free()) if value is not None]
+    return min(found, default=None)
+
+
+def _available() -> int | None:
+    try:
+        lines = MEMINFO.read_text().splitlines()
+    except OSError:
+        return None
+    for line in lines:
+        name, _, value = line.partition(":")
+        if name == "MemAvailable":
+            return int(value.split()[0]) * 1024
+    return None
+
+
+def _cgroup_free() -> list[int | None]:
+    """What each control group above this process still allows (versions 2 and 1)."""
+    try:
+        lines = CGROUP.read_text().splitlines()
+    except OSError:
+        return []
+    found: list[int | None] = []
+    for line in lines:
+        _, controllers, place = line.split(":", 2)
+        if controllers not in ("", "memory"):
+            continue
+        root = CGROUP_ROOT / controllers
+        names = ("memory.max", "memory.current")
+        if controllers:
+            names = ("memory.limit_in_bytes", "memory.usage_in_bytes")
+        folder = root / place.strip("/")
+        found += [
+            _left(parent, *names)
+            for parent in (folder, *folder.parents)
+            if root in (parent, *parent.parents)
+        ]
+    return found
+
+
+def _left(folder: Path, limit_name: str, used_name: str) -> int | None:
+    try:
+        limit, used = (int((folder / name).read_text()) for name in (limit_name, used_name))
+    except (OSError, ValueError):  # no such group, or a limit that is called "max"
+        return None
+    return max(limit - used, 0) + _file_cache(folder)
+
+
+def _file_cache(folder: Path) -> int:
+    """Counted as used, but given back when it is needed."""
+    try:
+        lines = (folder / "memory.stat").read_text().splitlines()
+    except OSError:
+        return 0
+    stats = dict(line.split(" ", 1) for line in lines if " " in line)
+    names = ("inactive_file", "total_inactive_file")
+    return max(int(stats.get(name, 0)) for name in names)
