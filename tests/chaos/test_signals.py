@@ -98,8 +98,17 @@ def test_a_fit_in_blocks_goes_on_at_the_epoch_where_it_stopped(tmp_path, monkeyp
     assert killing.result(tmp_path / "cut") == killing.result(tmp_path / "whole")
 
 
-@pytest.mark.parametrize("at", [50, 60, 69])
+class InLastTest(Signalling):
+    """Counts the steps of the last iteration's test only."""
+
+    def phase(self, iteration, num_iterations, name, total):
+        last = (iteration, name) == (num_iterations - 1, "evaluate")
+        self.steps = 0 if last else -(10**6)
+
+
+@pytest.mark.parametrize("at", [3, 10, 17])
 def test_what_planning_took_is_counted_through_a_stop(at, tmp_path, monkeypatch):
+    """Stops are in the middle of the first, second and third batch of the last test."""
     uses = []
     evaluate = training.evaluate_agent
 
@@ -112,7 +121,7 @@ def test_what_planning_took_is_counted_through_a_stop(at, tmp_path, monkeypatch)
     training.train_run(killing.tiny_config(), tmp_path / "whole")
     wanted = uses[-1]
     with pytest.raises(Terminated):
-        training.train_run(killing.tiny_config(), tmp_path / "cut", Signalling(15, at))
+        training.train_run(killing.tiny_config(), tmp_path / "cut", InLastTest(15, at))
     training.train_run(killing.tiny_config(), tmp_path / "cut")
     got = uses[-1]
     assert wanted.evaluations > wanted.steps > 0
