@@ -6,6 +6,7 @@ Of an episode the actions are kept, and made again.
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -161,7 +162,7 @@ def fitted_before(store: ProgressStore, fresh: FitState) -> tuple[FitState, list
         return fresh, []
     path = store.path("fit")
     try:
-        columns = EpochStats(*(part.arrays[f"stats.{name}"] for name in EpochStats._fields))
+        columns: list[Any] = [part.arrays[f"stats.{name}"] for name in EpochStats._fields]
         history = [EpochStats(*row) for row in zip(*columns, strict=True)]
     except (KeyError, TypeError, ValueError) as error:
         raise damaged(path, f"it holds no epochs: {error}") from None
