@@ -145,7 +145,7 @@ def _check_same_names(group: str, values: Values, train: Values) -> None:
 
 def _is_finite(value: Any) -> bool:
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    return number and abs(value) <= sys.float_info.max
+    return bool(number and abs(value) <= sys.float_info.max)
 
 
 def _to_lists(values: Values) -> dict[str, list[float]]:

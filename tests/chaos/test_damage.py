@@ -20,6 +20,7 @@ from headway.experiment.tables import EVALUATION_COLUMNS
 
 DATA = Path(__file__).parent.parent / "data"
 SECONDS, BYTES = 5.0, 2**30
+seconds: list[float] = []
 TEXTS = ("metrics.jsonl", "evaluation.csv", "assignments.csv", "prediction_error.csv")
 
 
@@ -32,7 +33,8 @@ def root(tmp_path) -> Path:
 @pytest.fixture(scope="module")
 def template():
     config = RunDir(DATA / "run-schema-2").config()
-    return training.initial(config, training.load_task(config))
+    task = training.load_task(config)
+    return training.eqx.filter_eval_shape(lambda: training.initial(config, task))
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -40,8 +42,9 @@ def memory():
     """No file may take much memory."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     yield
-    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-    assert grown * 1024 < BYTES
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
+    print(f"\n{len(seconds)} files, slowest {max(seconds):.2f} s, memory {grown / 2**20:.0f} MiB")
+    assert grown < BYTES
 
 
 def read_all(root: Path, template) -> None:
@@ -54,12 +57,17 @@ def read_all(root: Path, template) -> None:
     arrays.load_tree(newest, template)
 
 
+def in_time(start: float) -> None:
+    seconds.append(time.perf_counter() - start)
+    assert seconds[-1] < SECONDS
+
+
 def refused(read, *args) -> str:
     """The one line with which reading fails."""
     start = time.perf_counter()
     with pytest.raises((RunError, ConfigError)) as caught:
         read(*args)
-    assert time.perf_counter() - start < SECONDS
+    in_time(start)
     text = str(caught.value)
     assert "\n" not in text
     assert len(text) < 2000
@@ -75,7 +83,7 @@ def accepted_or_refused(read, *args) -> None:
         text = str(error)
     else:
         text = ""
-    assert time.perf_counter() - start < SECONDS
+    in_time(start)
     assert "\n" not in text
     assert len(text) < 2000
 

@@ -9,7 +9,7 @@ import time
 import killing
 import numpy as np
 import pytest
-from killing import NEVER
+from killing import ALWAYS, NEVER
 
 from headway.errors import BadEnvironmentError
 from headway.experiment import progress_store, resumable, training
@@ -261,16 +261,20 @@ def test_true_sigkills_change_nothing(environment, tmp_path):
     while kills < 10:
         path = tmp_path / f"run-{runs}"
         for _ in range(4):
-            process = start(path, 0.0)
-            while process.poll() is None and not (path / "config.json").exists():
-                time.sleep(0.01)
+            before = set(path.rglob("*"))
+            process = start(path, ALWAYS)
+            while process.poll() is None and set(path.rglob("*")) <= before:
+                time.sleep(0.01)  # until it has done something
             try:
-                process.wait(rng.uniform(0.0, 4.0))
+                process.wait(rng.uniform(0.0, 3.0))
                 break
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
                 kills += 1
+                finished = len(list((path / "manifests").glob("iteration-*.json")))
+                parts = len(list((path / "partial").glob("*.safetensors")))
+                print(f"kill {kills}: {finished} manifests, {parts} parts")
         assert start(path, NEVER).wait() == 0
         assert killing.result(path) == killing.result(tmp_path / "whole"), (kills, runs)
         runs += 1

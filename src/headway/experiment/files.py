@@ -36,12 +36,12 @@ def write_bytes(path: Path, content: bytes) -> None:
         LimitError: The disk is full, or would be nearly full.
     """
     make_dir(path.parent)
-    check_space(path, len(content))
+    if free_space(path) < len(content) + SPARE_BYTES:
+        raise _full(path, len(content))
     temporary = path.with_name(f".{path.name}{UNFINISHED}")
-    temporary.unlink(missing_ok=True)
+    temporary.unlink(missing_ok=True)  # never through a link that somebody left there
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     try:
-        # Never through a link that somebody left there.
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
         handle = os.open(temporary, flags, 0o666)
         with os.fdopen(handle, "wb") as file:
             file.write(content)
@@ -57,12 +57,21 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def make_dir(path: Path) -> None:
-    """Make a directory that survives a loss of power, and those above it."""
+    """Make a directory that survives a loss of power, and those above it.
+
+    Raises:
+        LimitError: The disk is full.
+    """
     if path.is_dir():
         return
     make_dir(path.parent)
-    path.mkdir(exist_ok=True)
-    sync_dir(path.parent)
+    try:
+        path.mkdir(exist_ok=True)
+        sync_dir(path.parent)
+    except OSError as error:
+        if error.errno not in _FULL:
+            raise
+        raise _full(path, 0) from None
 
 
 def remove(paths: Iterable[Path]) -> None:
@@ -84,21 +93,15 @@ def sync_dir(path: Path) -> None:
         os.close(handle)
 
 
-def check_space(path: Path, num_bytes: int) -> None:
-    """Notice a nearly full disk before anything is written.
-
-    Raises:
-        LimitError: Less than the file and a margin are free.
-    """
-    if shutil.disk_usage(path.parent).free < num_bytes + SPARE_BYTES:
-        raise _full(path, num_bytes)
+def free_space(path: Path) -> int:
+    """Bytes that are free on the disk where a file is, or will be."""
+    return shutil.disk_usage(next(folder for folder in path.parents if folder.exists())).free
 
 
 def _full(path: Path, num_bytes: int) -> LimitError:
-    free = shutil.disk_usage(path.parent).free
     return LimitError(
         f"the disk is too full to write {path}: {num_bytes + SPARE_BYTES:,} bytes needed with a"
-        f" margin, {free:,} free; free some space, then the same command goes on."
+        f" margin, {free_space(path):,} free; free some space, then the same command goes on."
     )
 
 

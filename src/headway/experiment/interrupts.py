@@ -5,6 +5,7 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
+from typing import Any
 
 _NOTICE = b"\nstopping as soon as this step or epoch is saved; once more stops at once\n"
 
@@ -54,7 +55,7 @@ def stop_requests() -> Iterator[StopRequest]:
         os.write(2, _NOTICE)  # a signal may come while something else is being printed
 
     numbers = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.getsignal(number) or signal.SIG_DFL for number in numbers}
+    before: dict[int, Any] = {n: signal.getsignal(n) or signal.SIG_DFL for n in numbers}
     for number in before:
         signal.signal(number, note)
     try:

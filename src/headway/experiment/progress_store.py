@@ -66,9 +66,10 @@ class ProgressStore:
             parts = {n: (part["file"], dict(part["facts"])) for n, part in facts["parts"].items()}
             seconds = {name: float(value) for name, value in facts["seconds"].items()}
             serial = int(facts["serial"])
+            fitting = {file for file, _ in parts.values()} == set(manifest.files)
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise files.damaged(path, f"it lacks {error}") from None
-        if {file for file, _ in parts.values()} != set(manifest.files):
+        if not fitting:
             raise files.damaged(path, "its parts are not its files")
         self._parts, self._digests = parts, manifest.files
         self.seconds, self._serial = seconds, serial

@@ -188,7 +188,7 @@ def fitted_before(store: ProgressStore, fresh: FitState) -> tuple[FitState, list
         return fresh, []
     path = store.path("fit")
     try:
-        columns = EpochStats(*(part.arrays[f"stats.{name}"] for name in EpochStats._fields))
+        columns: list[Any] = [part.arrays[f"stats.{name}"] for name in EpochStats._fields]
         history = [EpochStats(*row) for row in zip(*columns, strict=True)]
     except (KeyError, TypeError, ValueError) as error:
         raise damaged(path, f"it holds no epochs: {error}") from None
