@@ -11,7 +11,7 @@ from headway.config import Config
 from headway.errors import unknown_name
 from headway.experiment.evaluation import PlanningCost, episode_rows, evaluate_agent
 from headway.experiment.limits import check_memory
-from headway.experiment.methods import make_config, tested_config
+from headway.experiment.methods import config_to_evaluate, make_config
 from headway.experiment.progress import Progress
 from headway.experiment.rollouts import Arena
 from headway.experiment.runs import RunDir
@@ -138,7 +138,7 @@ def evaluate(
     changes = dict(settings or {})
     if num_episodes is not None:
         changes["evaluation.num_episodes"] = num_episodes
-    config = tested_config(run.config(), changes)
+    config = config_to_evaluate(run.config(), changes)
     check_memory(need_of(config).to_test)
     agent = load_agent(run, config)
     arena = Arena.make(config)

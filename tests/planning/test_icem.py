@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from search_helpers import ACTIONS, HORIZON, KEY, NUM_ENVS, begin, start, towards, watch
 
-from headway.planning.optimizers import ICEM
+from headway.planning.optimizers import ICEM, SearchState
 from headway.planning.optimizers.noise import colored_noise
 
 AIMS = [0.9, -0.2]
@@ -96,6 +96,8 @@ def test_the_best_elites_compete_again_in_the_next_iteration_and_at_the_next_ste
 def test_a_first_search_has_draws_where_there_are_no_elites_yet():
     _, seen = watch(SMALL, towards(AIMS), begin(SMALL, start()))
     assert_drawn(seen[0][:, SMALL.populations[0] :])
+    _, bare = watch(SMALL, towards(AIMS), SearchState(start()))
+    np.testing.assert_array_equal(bare[0], seen[0])
 
 
 def test_elites_without_a_finite_return_are_not_kept():

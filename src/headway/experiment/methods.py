@@ -147,7 +147,7 @@ _PRESETS = (
     ),
 )
 
-TESTED_SECTIONS = ("planner", "evaluation")  # what a trained run can be tested with
+EVALUATED_SECTIONS = ("planner", "evaluation")  # what a trained run can be tested with
 
 METHODS: dict[str, Method] = {method.name: method for method in _METHODS}
 PRESETS: dict[str, Preset] = {preset.name: preset for preset in _PRESETS}
@@ -189,22 +189,22 @@ def make_config(
     return config
 
 
-def tested_config(config: Config, settings: Settings) -> Config:
+def config_to_evaluate(config: Config, settings: Settings) -> Config:
     """The settings of a trained run with some of its tests' replaced.
 
     Args:
         config: The settings that the run was trained with.
-        settings: Changes by dotted name, of the sections in `TESTED_SECTIONS` only.
+        settings: Changes by dotted name, of the sections in `EVALUATED_SECTIONS` only.
 
     Raises:
         ConfigError: A setting is unknown, of the wrong type or out of range, or one that
             training has fixed.
     """
     for name in settings:
-        if name in setting_names(config) and name.partition(".")[0] not in TESTED_SECTIONS:
+        if name in setting_names(config) and name.partition(".")[0] not in EVALUATED_SECTIONS:
             raise ConfigError(
                 f"{name} is fixed by training, allowed: settings of"
-                f" {' and '.join(TESTED_SECTIONS)}; train another run to change it."
+                f" {' and '.join(EVALUATED_SECTIONS)}; train another run to change it."
             )
     return override(config, settings)
 

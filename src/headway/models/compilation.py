@@ -60,7 +60,8 @@ def keep_compilations() -> None:
     `JAX_ENABLE_COMPILATION_CACHE=0` turns it off. JAX looks once, at its first compilation:
     that is why this runs on import.
     """
-    if jax.config.jax_compilation_cache_dir is None:
+    settings: Any = jax.config  # JAX declares its settings while running
+    if settings.jax_compilation_cache_dir is None:
         folder = platformdirs.user_cache_path("headway", appauthor=False) / "compiled"
         jax.config.update("jax_compilation_cache_dir", str(folder))
 

@@ -135,19 +135,21 @@ class ImaginedDynamics(eqx.Module):
         out = self.heads.layer(x)
         obs_size = self.delta_std.shape[0]
         mean = out[:, :obs_size]
-        if noise is None or not self.stochastic:
+        low, high = self.heads.min_logvar, self.heads.max_logvar
+        if noise is None or low is None or high is None:
             return mean
-        return mean + noise * self._std(out[:, obs_size:])
+        return mean + noise * self._std(out[:, obs_size:], low, high)
 
     def _std(
-        self, logvar: Float[Array, "member choice_obs particle candidate"]
+        self,
+        logvar: Float[Array, "member choice_obs particle candidate"],
+        low: Float[Array, "member choice obs"],
+        high: Float[Array, "member choice obs"],
     ) -> Float[Array, "member obs particle candidate"]:
         """Standard deviation of the average of the choices' samples, in raw units."""
-        members, choices, obs_size = self.heads.min_logvar.shape
+        members, choices, obs_size = low.shape
         logvar = logvar.reshape(members, choices, obs_size, *logvar.shape[2:])
-        low = self.heads.min_logvar[..., None, None]
-        high = self.heads.max_logvar[..., None, None]
-        bounded = bound_logvar(logvar, low, high)
+        bounded = bound_logvar(logvar, low[..., None, None], high[..., None, None])
         scale = self.delta_std[:, None, None]
         if choices == 1:
             return jnp.exp(0.5 * bounded[:, 0]) * scale

@@ -56,11 +56,9 @@ class ICEM(Optimizer):
         return sum(self.populations) + self.num_kept * self.num_iterations + 1
 
     def init(self, num_envs: int, horizon: int, action_size: int) -> SearchState:
-        """See `Optimizer.init`; there are no elites yet."""
+        """See `Optimizer.init`."""
         state = super().init(num_envs, horizon, action_size)
-        shape = (num_envs, self.num_kept, horizon, action_size)
-        unknown = jnp.full(shape, jnp.inf, state.guess.dtype)
-        return state._replace(elites=unknown)
+        return state._replace(elites=self._remembered(state))
 
     def optimize(self, score: Score, state: SearchState, *, key: PRNGKeyArray) -> Plan:
         """See `Optimizer.optimize`."""
@@ -80,14 +78,21 @@ class ICEM(Optimizer):
     def shift(self, state: SearchState) -> SearchState:
         """See `Optimizer.shift`; the mean repeats its last action, the elites' is drawn."""
         guess = shift_steps(state.guess, last=state.guess[:, -1:])
-        return SearchState(guess, elites=shift_steps(state.elites, last=jnp.inf))
+        return SearchState(guess, elites=shift_steps(self._remembered(state), last=jnp.inf))
+
+    def _remembered(self, state: SearchState) -> Float[Array, "env elite horizon action"]:
+        """The elites of a state; where it has none, all of them are still to be drawn."""
+        if state.elites is not None:
+            return state.elites
+        num_envs, *sequence_shape = state.guess.shape
+        return jnp.full((num_envs, self.num_kept, *sequence_shape), jnp.inf, state.guess.dtype)
 
     def _start(self, state: SearchState) -> "_Search":
         num_envs = len(state.guess)
         return _Search(
             mean=state.guess,
             std=jnp.full_like(state.guess, self.initial_std),
-            elites=state.elites,
+            elites=self._remembered(state),
             best=state.guess,
             best_return=jnp.full(num_envs, -jnp.inf),
             failures=jnp.zeros(num_envs, jnp.int32),
