@@ -91,6 +91,11 @@ def read_csv(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
     return list(parse_csv(path, files.read_bytes(path), columns)) if path.exists() else []
 
 
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write a whole table, beside and renamed."""
+    files.write_bytes(path, csv_lines(columns, rows, header=True).encode())
+
+
 def trajectory_arrays(trajectories: Sequence[Trajectory]) -> Arrays:
     """The arrays of some trajectories, by number and name."""
     return {
