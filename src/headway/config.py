@@ -195,6 +195,9 @@ class PlannerConfig:
     and candidates are compared under equal luck."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """What the networks multiply while planning; sums and states are always float32."""
+    devices: Literal["local", "all"] = "local"
+    """Which devices share the candidates: those of this process, or of all processes that
+    `jax.distributed` joins, which must then all act alike, step by step."""
     head_selection: HeadSelection = "adaptive"
     """Which head plans: the best on recent transitions, their average, or a random one."""
     selection_length: int = 10
@@ -226,6 +229,7 @@ class PlannerConfig:
         problems.one_of("reward", ("task", "released"))
         problems.one_of("particle_noise", ("independent", "shared"))
         problems.one_of("precision", ("float32", "bfloat16"))
+        problems.one_of("devices", ("local", "all"))
         share = {"icem": 2, "mppi": 0, "random-shooting": 0}.get(self.optimizer, 1)
         problems.require(
             share * self.num_elites <= self.num_candidates,

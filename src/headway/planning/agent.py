@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from headway.config import PlannerConfig
 from headway.models.compilation import jit_networks
 from headway.models.dynamics import MultiHeadDynamics, Statistics
+from headway.planning.devices import whole_on_each
 from headway.planning.heads import RecentTransitions, head_errors, select_heads
 from headway.planning.imagination import ImaginedDynamics
 from headway.planning.optimizers import SearchState, make_optimizer, where_env
@@ -105,7 +106,8 @@ def _act(
     action = plan.actions[:, 0]
     acted = jnp.ones_like(state.acted)
     state = AgentState(recent, obs, action, acted, optimizer.shift(plan.state), key)
-    return state, Decision(action, heads, plan.failures, plan.evaluations)
+    decision = Decision(action, heads, plan.failures, plan.evaluations)
+    return whole_on_each((state, decision), agent.planner.devices)
 
 
 _act_float32 = jit_networks(_act)

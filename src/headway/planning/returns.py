@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.config import PlannerConfig
-from headway.planning.devices import environments_at_once, spread_candidates
+from headway.planning.devices import Devices, environments_at_once, spread_candidates
 from headway.planning.imagination import ChosenHeads, ImaginedDynamics
 from headway.tasks.base import Task
 
@@ -23,6 +23,8 @@ class RolloutSettings:
     """Whether all candidates of a step share the noise of their particles."""
     released_reward: bool = False
     """Whether to plan with the released code's reward."""
+    devices: Devices = "local"
+    """Which devices share the candidates."""
 
     @classmethod
     def of(cls, planner: PlannerConfig, num_members: int) -> "RolloutSettings":
@@ -31,6 +33,7 @@ class RolloutSettings:
             planner.num_particles // num_members,
             planner.particle_noise == "shared",
             planner.reward == "released",
+            planner.devices,
         )
 
 
@@ -91,13 +94,12 @@ def _environment_returns(
     reward_of = task.released_reward if settings.released_reward else task.reward
     reward_of, terminated = over_rows(reward_of), over_rows(task.terminated)
     scale_action = over_rows(task.scale_action)
+    spread = functools.partial(spread_candidates, devices=settings.devices)
 
     def imagine(carry, step):
         obs, alive, total = carry
         scaled, noise = step
-        scaled = spread_candidates(
-            jnp.broadcast_to(scaled[:, None], (members, action_size, *rows[1:]))
-        )
+        scaled = spread(jnp.broadcast_to(scaled[:, None], (members, action_size, *rows[1:])))
         next_obs = imagine_step(dynamics, task, obs, scaled, draw(noise, obs.shape))
         action = scale_action(scaled)
         total = total + jnp.where(alive, reward_of(obs, action, next_obs), 0.0)
@@ -109,14 +111,14 @@ def _environment_returns(
             return None
         if settings.shared_noise:
             return noise[..., None]
-        return spread_candidates(jax.random.normal(noise, shape))
+        return spread(jax.random.normal(noise, shape))
 
     if settings.shared_noise and dynamics.stochastic:
         noise = jax.random.normal(key, (horizon, members, obs.shape[0], particles))
     else:
         noise = jax.random.split(key, horizon)
     start = jnp.broadcast_to(obs[:, None, None], (members, obs.shape[0], *rows[1:]))
-    carry = spread_candidates(start), jnp.ones(rows, bool), jnp.zeros(rows)
+    carry = spread(start), jnp.ones(rows, bool), jnp.zeros(rows)
     (_, _, total), _ = jax.lax.scan(imagine, carry, (candidates.transpose(1, 2, 0), noise))
     return total.mean((0, 1))
 
