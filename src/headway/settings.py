@@ -2,7 +2,6 @@
 
 import dataclasses
 import difflib
-import types
 import typing
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -138,7 +137,7 @@ def _convert(hint: Any, value: Any, name: str) -> Any:
         return tuple(_convert(int, item, name) for item in value)
     if origin is Literal and isinstance(value, str):
         return value
-    if origin is not None and origin is not types.UnionType and origin is not tuple:
+    if origin is Mapping:
         if isinstance(value, Mapping) and all(isinstance(v, bool) for v in value.values()):
             return dict(value)
     elif hint is float and isinstance(value, int | float) and not isinstance(value, bool):

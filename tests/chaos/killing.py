@@ -63,6 +63,10 @@ class KillingOS:
         self._trigger.pull()
         os.fsync(handle)
 
+    def unlink(self, path):
+        self._trigger.pull()
+        os.unlink(path)  # noqa: PTH108
+
     def replace(self, source, target):
         self._trigger.pull()
         os.replace(source, target)  # noqa: PTH105
@@ -112,16 +116,8 @@ def train(config: Config, path: Path, monkeypatch, *, kill_at: int = 0, every: f
         Killed: At the place asked for.
     """
     trigger = Trigger(kill_at)
-    plain_remove = files.remove
-
-    def remove(paths):
-        for one in paths:
-            trigger.pull()
-            plain_remove([one])
-
     with monkeypatch.context() as patch:
         patch.setattr(files, "os", KillingOS(trigger))
-        patch.setattr(files, "remove", remove)
         patch.setattr(progress_store, "EVERY", every)
         training.train_run(config, path, KillingProgress(trigger))
     return trigger

@@ -4,6 +4,7 @@ A file may be cut short, have a flipped bit, or come from a stranger. Whatever i
 it ends soon, takes little memory, runs nothing, and says in one line what is wrong.
 """
 
+import contextlib
 import errno
 import hashlib
 import json
@@ -39,7 +40,7 @@ def write_bytes(path: Path, content: bytes) -> None:
     if free_space(path) < len(content) + SPARE_BYTES:
         raise _full(path, len(content))
     temporary = path.with_name(f".{path.name}{UNFINISHED}")
-    temporary.unlink(missing_ok=True)  # never through a link that somebody left there
+    remove([temporary])  # never written through a link that somebody left there
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
     try:
         handle = os.open(temporary, flags, 0o666)
@@ -52,7 +53,8 @@ def write_bytes(path: Path, content: bytes) -> None:
     except OSError as error:
         if error.errno not in _FULL:
             raise
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # on such a disk even that may fail
+            temporary.unlink(missing_ok=True)
         raise _full(path, len(content)) from None
 
 
@@ -75,11 +77,24 @@ def make_dir(path: Path) -> None:
 
 
 def remove(paths: Iterable[Path]) -> None:
-    """Delete files, in this order; missing ones are no error."""
+    """Delete files, in this order; missing ones are no error.
+
+    Raises:
+        LimitError: The disk is so full that nothing can be deleted, as some file systems are.
+    """
     for path in paths:
-        if path.is_symlink() or path.exists():
-            path.unlink(missing_ok=True)
+        if not (path.is_symlink() or path.exists()):
+            continue
+        try:
+            os.unlink(path)  # noqa: PTH108 (one name for tests to interrupt)
             sync_dir(path.parent)
+        except OSError as error:
+            if error.errno not in _FULL:
+                raise
+            raise LimitError(
+                f"the disk is too full to delete {path}; free some space, then the same command"
+                " goes on."
+            ) from None
 
 
 def sync_dir(path: Path) -> None:
