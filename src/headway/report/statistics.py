@@ -214,7 +214,7 @@ def caution(num_runs: int) -> str:
     """Warn of intervals that are too narrow; nothing where there are runs enough."""
     if num_runs >= ENOUGH_RUNS:
         return ""
-    return f" Intervals from fewer than {ENOUGH_RUNS} seeds are too narrow; more seeds may undo it."
+    return f" Intervals from fewer than {ENOUGH_RUNS} seeds are too narrow: a hint, no proof."
 
 
 def _seeds(num_runs: int) -> str:
