@@ -23,6 +23,8 @@ Control that keeps making headway when the physics changes.
 commands:
   train ENV           train a controller on an environment whose physics vary
   evaluate RUN        test a trained run on training and unseen physics
+  diagnose RUN        measure how well a trained run selects heads
+  report RUN ...      compare runs on one HTML page
   list WHAT           list envs, methods or presets
   plot-dynamics ENV   draw what an action leads to under each physics
 

@@ -18,6 +18,7 @@ from headway.cli.arguments import (
     WithSettings,
     changed_settings,
 )
+from headway.cli.reports import report
 from headway.cli.usage import UsageError, parse, wants_help
 from headway.config import Config
 from headway.errors import ConfigError, unknown_name
@@ -134,6 +135,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "evaluate": evaluate,
     "list": list_names,
     "plot-dynamics": plot_dynamics,
+    "report": report,
 }
 
 

@@ -34,7 +34,7 @@ _MARGIN, _TITLE, _LEGEND = 0.16, 0.42, 0.3  # inches
 _LEGEND_SYMBOL, _LEGEND_LETTER, _LEGEND_LINE = 0.5, 0.062, 0.19  # inches
 _CAPTION_LINE, _CAPTION_LETTER = 0.155, 0.055  # inches
 
-_SETTINGS: dict[Any, Any] = {
+SETTINGS: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
     "font.size": 9.0,
@@ -82,7 +82,7 @@ def figure(path: Path, *, title: str, caption: str, size: tuple[float, float]) -
         caption: What the marks are and where the numbers come from; wrapped to the width.
         size: Width and height in inches.
     """
-    with matplotlib.rc_context(_SETTINGS):
+    with matplotlib.rc_context(SETTINGS):
         width, height = size
         drawing = Figure(figsize=size)
         FigureCanvasAgg(drawing)
