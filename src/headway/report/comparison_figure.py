@@ -82,7 +82,7 @@ def _curves(axes: Axes, found: Found, env: str) -> None:
     axes.set_xlim(left=0)
     axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.xaxis.set_major_formatter("{x:,.0f}")
-    axes.yaxis.set_major_formatter("{x:,.0f}")
+    axes.yaxis.set_major_formatter("{x:,.6g}")
     label_axis(axes, "environment steps collected", "return per episode")
 
 
@@ -105,7 +105,7 @@ def _dots(axes: Axes, found: Found, env: str) -> None:
     axes.grid(visible=False, axis="y")
     axes.grid(visible=True, axis="x")
     axes.xaxis.set_major_locator(MaxNLocator(4))
-    axes.xaxis.set_major_formatter("{x:,.0f}")
+    axes.xaxis.set_major_formatter("{x:,.6g}")
     axes.set_xlabel("return per episode")
 
 
