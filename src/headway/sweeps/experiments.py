@@ -72,6 +72,13 @@ def _segments(length: int) -> Arm:
     return Arm(f"M = {length}", settings={"fitting.segment_length": length})
 
 
+def _past(length: int) -> Arm:
+    chosen: dict[str, Any] = {"planner.selection_length": length}
+    if length == 1:  # the preset `released-code` would skip this only transition
+        chosen["planner.selection_skips_newest"] = False
+    return Arm(f"N = {length}", settings=chosen)
+
+
 def _all_methods() -> tuple[Arm, ...]:
     return tuple(Arm(_LABELS.get(name, name), name) for name in METHODS)
 
@@ -108,10 +115,7 @@ _EXPERIMENTS = (
     Experiment(
         "fig16",
         "past transitions N that select a head",
-        tuple(
-            Arm(f"N = {length}", settings={"planner.selection_length": length})
-            for length in SELECTION_LENGTHS
-        ),
+        tuple(_past(length) for length in SELECTION_LENGTHS),
     ),
     Experiment(
         "heads",
