@@ -190,9 +190,10 @@ class List:
     """List what can be named on the command line."""
 
     what: Annotated[
-        tyro.conf.Positional[Literal["envs", "methods", "presets"]], tyro.conf.arg(metavar="WHAT")
+        tyro.conf.Positional[Literal["envs", "methods", "presets", "experiments"]],
+        tyro.conf.arg(metavar="WHAT"),
     ]
-    """envs, methods or presets."""
+    """envs, methods, presets or experiments."""
     json: Flag = False
     """Print one JSON line on stdout instead of a table."""
 

@@ -69,11 +69,14 @@ SETTINGS: dict[Any, Any] = {
     "lines.solid_capstyle": "round",
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
+    "svg.hashsalt": "headway",
 }
 
 
 @contextlib.contextmanager
-def figure(path: Path, *, title: str, caption: str, size: tuple[float, float]) -> Iterator[Figure]:
+def figure(
+    path: Path, *, title: str, caption: str, size: tuple[float, float], svg: bool = False
+) -> Iterator[Figure]:
     """Make a figure, hand it out to be drawn on, and write it.
 
     Args:
@@ -81,6 +84,7 @@ def figure(path: Path, *, title: str, caption: str, size: tuple[float, float]) -
         title: One line that says what is seen.
         caption: What the marks are and where the numbers come from; wrapped to the width.
         size: Width and height in inches.
+        svg: Whether to write an SVG file beside the PNG as well.
     """
     with matplotlib.rc_context(SETTINGS):
         width, height = size
@@ -99,6 +103,10 @@ def figure(path: Path, *, title: str, caption: str, size: tuple[float, float]) -
         image = io.BytesIO()
         drawing.savefig(image, format="png", dpi=DPI)
         files.write_bytes(path, image.getvalue())
+        if svg:
+            drawn = io.BytesIO()
+            drawing.savefig(drawn, format="svg", metadata={"Date": None})
+            files.write_bytes(path.with_suffix(".svg"), drawn.getvalue())
 
 
 def legend(drawing: Figure, handles: Sequence[Any] | None = None) -> None:
