@@ -16,11 +16,20 @@ from headway.sim_params import SimParamSets
 Oracle = Literal["independent", "transition", "trajectory"]
 OptimizerName = Literal["cem", "icem", "mppi", "random-shooting"]
 HeadSelection = Literal["adaptive", "average", "random"]
+ModelKind = Literal["multi-headed", "gradient-adapted", "recurrent", "simulator", "none"]
 
 LARGEST = 10**9
 """No number of anything is larger; a file that says so is wrong, or means harm."""
 MAX_LAYERS = 64
 """Hidden layers of a network."""
+PLAIN: Mapping[str, Any] = {
+    "num_members": 1,
+    "num_heads": 1,
+    "context_size": 0,
+    "backward_net": False,
+    "deterministic": True,
+}
+"""Settings of every kind of model that is no multi-headed ensemble."""
 
 
 class _Problems:
@@ -73,8 +82,13 @@ class _Problems:
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """The dynamics model: an ensemble of multi-headed networks (supplement A.3)."""
+    """The dynamics model: by default an ensemble of multi-headed networks (supplement A.3)."""
 
+    kind: ModelKind = "multi-headed"
+    """What predicts: an ensemble of multi-headed networks; one network that a gradient step
+    adapts to the newest transitions (GrBAL); a recurrent one (ReBAL); the simulator itself; or
+    nothing, and actions are random. All but the first have one member, one head, no context and
+    no variance."""
     num_members: int = 5
     """Networks in the ensemble."""
     num_heads: int = 3
@@ -98,6 +112,13 @@ class ModelConfig:
         problems.at_least(0, "context_size")
         problems.sizes("hidden_sizes")
         problems.sizes("context_hidden_sizes")
+        problems.one_of("kind", typing.get_args(ModelKind))
+        if self.kind != "multi-headed":
+            plain = {name: getattr(self, name) for name in PLAIN}
+            problems.require(
+                plain == PLAIN,
+                f"kind {shown(self.kind)} has {plain}, allowed: {PLAIN}",
+            )
         problems.report()
 
 
@@ -317,5 +338,10 @@ class Config:
             self.planner.num_particles % self.model.num_members == 0,
             f"planner.num_particles is {self.planner.num_particles}, allowed: a multiple of"
             f" model.num_members ({self.model.num_members})",
+        )
+        problems.require(
+            self.model.kind != "simulator" or self.planner.num_particles == 1,
+            f"planner.num_particles is {self.planner.num_particles}, allowed: 1, because the"
+            " simulator has no noise",
         )
         problems.report()

@@ -16,7 +16,6 @@ from headway.models.fitting import FitSetup, assign_segments
 from headway.planning.agent import Agent, choose_heads, encode, planning_heads
 from headway.planning.heads import RecentTransitions
 from headway.planning.imagination import ImaginedDynamics
-from headway.planning.returns import imagine_step
 
 NUM_STARTS = 256  # imagined rollouts per group in `prediction_error`
 
@@ -103,7 +102,7 @@ def _imagine(
 
         def step(obs, action):
             wide = jnp.broadcast_to(action[:, None, None], (members, action.size, 1, 1))
-            obs = imagine_step(one, agent.task, obs, wide, None)
+            _, obs = one.step(agent.task, (), obs, wide, None)
             return obs, obs[..., 0, 0]
 
         start = jnp.broadcast_to(now[:, None, None], (members, now.size, 1, 1))

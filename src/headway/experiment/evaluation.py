@@ -13,7 +13,7 @@ from headway.experiment.progress_store import ProgressStore
 from headway.experiment.resumable import resumable_episodes
 from headway.experiment.rollouts import AgentPolicy, Arena, Episode, PlannerUse, run_episodes
 from headway.experiment.tables import EpisodeRow
-from headway.planning.agent import Agent
+from headway.planning.acting import Acting
 from headway.planning.flop import plan_flop
 from headway.sim_params import SimParamSets
 from headway.tasks.base import Task
@@ -66,7 +66,7 @@ def group_episodes(
 
 
 def evaluate_agent(
-    agent: Agent,
+    agent: Acting,
     arena: Arena,
     config: Config,
     groups: Sequence[str],

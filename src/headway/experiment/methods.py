@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from headway.config import Config
+from headway.config import PLAIN, Config
 from headway.errors import ConfigError, unknown_name
 from headway.settings import override, setting_names
 from headway.tasks.catalog import EnvSpec, env_spec
@@ -35,6 +35,16 @@ class Preset:
 
 
 _NO_CONTEXT: Settings = {"model.context_size": 0, "model.backward_net": False}
+
+_PLAIN: Settings = {
+    **{f"model.{name}": value for name, value in PLAIN.items()},
+    "fitting.oracle": "independent",
+    "fitting.future_length": 1,
+    "planner.num_particles": 1,
+}
+"""One network without heads, context or noise."""
+
+_ONLY_A_TEST: Settings = {"collection.num_iterations": 1}
 
 _METHODS = (
     Method("tmcl", "trajectory-wise multiple choice learning (the paper's method)", {}),
@@ -75,6 +85,16 @@ _METHODS = (
             "fitting.future_length": 1,
             "planner.num_particles": 1,
         },
+    ),
+    Method(
+        "random",
+        "uniform random actions; nothing is learned",
+        {**_PLAIN, **_ONLY_A_TEST, "model.kind": "none"},
+    ),
+    Method(
+        "true-dynamics",
+        "the same planner on the real simulator: the environment's ceiling",
+        {**_PLAIN, **_ONLY_A_TEST, "model.kind": "simulator"},
     ),
 )
 

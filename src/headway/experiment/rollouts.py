@@ -18,7 +18,7 @@ from headway import envs
 from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import BadEnvironmentError
-from headway.planning.agent import Agent
+from headway.planning.acting import Acting
 from headway.planning.controller import env_action
 from headway.sim_params import SimParamSets
 from headway.tasks.base import Task
@@ -104,7 +104,7 @@ def random_policy(arena: Arena, rng: np.random.Generator) -> Policy:
 class AgentPolicy:
     """An agent and what it remembers of each environment; it starts with an empty memory."""
 
-    def __init__(self, agent: Agent, num_envs: int, *, key: PRNGKeyArray):
+    def __init__(self, agent: Acting, num_envs: int, *, key: PRNGKeyArray):
         self._agent = agent
         self.state = agent.init(num_envs, key=key)
 

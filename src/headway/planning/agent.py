@@ -35,8 +35,9 @@ class Decision(NamedTuple):
 
     action: Float[Array, "env action"]
     """The action to take, in [-1, 1]."""
-    heads: Int[Array, "env member"]
-    """The head each member plans with; with `average`, the one that would be adaptive."""
+    heads: Int[Array, "env member"] | None
+    """The head each member plans with; with `average`, the one that would be adaptive. None
+    where a model has no heads."""
     failures: Int[Array, " env"]
     """Planner iterations without any finite return."""
     evaluations: Int[Array, " env"]

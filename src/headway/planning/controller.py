@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from headway.errors import ConfigError
-from headway.planning.agent import Agent
+from headway.planning.acting import Acting
 from headway.tasks.base import Task
 
 
@@ -17,7 +17,7 @@ class Controller:
         seed: Seeds the planner's draws.
     """
 
-    def __init__(self, agent: Agent, *, seed: int = 0):
+    def __init__(self, agent: Acting, *, seed: int = 0):
         self.agent = agent
         self._seed = seed
         self._episode = -1
@@ -55,13 +55,15 @@ class Controller:
                 f"obs[{entry}] is {obs[entry]}, allowed: finite numbers; check the sensor."
             )
         self._state, decision = self.agent.act(self._state, obs[None].astype(np.float32))
-        scaled, heads = jax.device_get((decision.action[0], decision.heads[0]))
-        self._heads = heads
-        return env_action(task, scaled)
+        scaled, heads = jax.device_get((decision.action, decision.heads))
+        self._heads = None if heads is None else heads[0]
+        return env_action(task, scaled[0])
 
     @property
     def heads(self) -> Int[np.ndarray, " member"] | None:
-        """The prediction head that each member plans with now; None before the first action.
+        """The prediction head that each member plans with now.
+
+        None before the first action, and where the model has no heads.
 
         With `head_selection="average"`, which plans with all heads, the one that explains the
         recent past best.

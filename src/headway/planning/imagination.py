@@ -5,14 +5,17 @@ weights differ; candidates come last, so that every elementwise operation, slice
 features runs over long contiguous rows, and what all candidates share is a plain broadcast.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.networks import Dense, DenseHeads, bound_logvar, swish
+from headway.tasks.base import Task
 
 PRECISIONS = {"float32": jnp.float32, "bfloat16": jnp.bfloat16}
 
@@ -110,6 +113,18 @@ class ImaginedDynamics(eqx.Module):
         return ImaginedDynamics(self.hidden, heads, self.delta_std)
 
     @property
+    def per_env(self) -> ChosenHeads:
+        """See `Dynamics.per_env`."""
+        return self.heads
+
+    of_env = with_heads
+
+    @property
+    def widest(self) -> int:
+        """See `Dynamics.widest`."""
+        return max(layer.bias.shape[-1] for layer in self.hidden)
+
+    @property
     def num_members(self) -> int:
         """Networks in the ensemble."""
         return self.hidden[0].bias.shape[0]
@@ -118,6 +133,22 @@ class ImaginedDynamics(eqx.Module):
     def stochastic(self) -> bool:
         """Whether deltas have a variance."""
         return self.heads.min_logvar is not None
+
+    def start(self) -> tuple[()]:
+        """See `Dynamics.start`; nothing is carried from step to step."""
+        return ()
+
+    def step(
+        self,
+        task: Task,
+        carry: tuple[()],
+        obs: Float[Array, "member obs particle candidate"],
+        action: Float[Array, "member action particle candidate"],
+        noise: Float[Array, "member obs particle #candidate"] | None,
+    ) -> tuple[tuple[()], Float[Array, "member obs particle candidate"]]:
+        """See `Dynamics.step`."""
+        x = jnp.concatenate([over_rows(task.preprocess)(obs), action], axis=1)
+        return carry, over_rows(task.postprocess)(obs, self.sample_delta(x, noise))
 
     def sample_delta(
         self,
@@ -181,3 +212,8 @@ def _chosen(
     hidden_size = weight.shape[-2] - context.shape[-1]
     bias = bias + jnp.einsum("mec,emkco->emko", context, weight[..., hidden_size:, :])
     return weight[..., :hidden_size, :], bias
+
+
+def over_rows(function: Callable) -> Callable:
+    """Let a Task's method, which wants features last, take [member, feature, *rows]."""
+    return jax.vmap(jax.vmap(function, in_axes=-1, out_axes=-1), in_axes=-1, out_axes=-1)
