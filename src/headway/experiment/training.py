@@ -14,14 +14,14 @@ from jaxtyping import PRNGKeyArray
 
 from headway.config import Config
 from headway.data import ReplayBuffer, Trajectory
-from headway.errors import DivergenceError, RunError
+from headway.errors import RunError
 from headway.experiment import arrays
-from headway.experiment.blocks import BlockedData, Layout, fit_blocks
+from headway.experiment.blocks import BlockedData, Layout, check_epoch, fit_blocks
 from headway.experiment.diagnostics import head_shares, prediction_error
 from headway.experiment.evaluation import episode_rows, evaluate_agent
 from headway.experiment.interrupts import StopRequest, stop_requests
 from headway.experiment.limits import MemoryNeed, check_memory, memory_need
-from headway.experiment.methods import check_block, check_options
+from headway.experiment.methods import check_block, check_options, told_sim_params
 from headway.experiment.progress import Progress
 from headway.experiment.progress_store import ProgressStore
 from headway.experiment.resumable import (
@@ -42,7 +42,7 @@ from headway.experiment.rollouts import (
 from headway.experiment.runs import RunDir
 from headway.experiment.tensorboard import write_tensorboard
 from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.models.fitting import EpochStats, FitSetup, FitState
+from headway.models.fitting import FitSetup, FitState
 from headway.planning.agent import Agent
 from headway.tasks.base import Task
 from headway.tasks.catalog import env_spec
@@ -170,7 +170,7 @@ class Trainer:
         def policy() -> Policy:
             if iteration == 0:
                 return random_policy(arena, rng)
-            return AgentPolicy(self.agent, num_episodes, key=key)
+            return AgentPolicy(self.agent, num_episodes, episodes, key=key)
 
         self.phase(iteration, "collect")
         advance = self.progress.advance
@@ -223,7 +223,8 @@ class Trainer:
     def fit_data(self, key: PRNGKeyArray) -> BlockedData:
         """Everything collected, with renewed statistics, ready to be fitted."""
         model, trajectories = self.config.model, self.buffer.trajectories
-        statistics = Statistics.fit(self.arena.task, trajectories, model.history_length)
+        names = self.layout.sim_param_names
+        statistics = Statistics.fit(self.arena.task, trajectories, model.history_length, names)
         return BlockedData(
             trajectories, self.layout, statistics, self.setup, model.num_members, key
         )
@@ -320,19 +321,6 @@ def need_of(config: Config) -> MemoryNeed:
     return memory_need(config, load_task(config), length)
 
 
-def check_epoch(stats: EpochStats, iteration: int, epoch: int) -> None:
-    """Stop a fit that has lost all finite numbers.
-
-    Raises:
-        DivergenceError: No update of the epoch was taken.
-    """
-    if stats.skipped == stats.updates:
-        raise DivergenceError(
-            f"no update of epoch {epoch} of iteration {iteration} had a finite loss and gradient;"
-            " try a smaller fitting.learning_rate."
-        )
-
-
 def make_agent(config: Config, task: Task, learned: Learned) -> Agent:
     """Join what was learned with the planner's settings."""
     return Agent(
@@ -344,8 +332,10 @@ def initial(config: Config, task: Task) -> Learned:
     """The untrained networks of a seed."""
     setup = FitSetup(task, config.fitting, config.model.history_length)
     key = jax.random.fold_in(jax.random.key(config.seed), 0)
-    model = MultiHeadDynamics.init(config.model, task, key=key)
-    return Learned(setup.init(model), Statistics.identity(task, config.model.history_length))
+    names = told_sim_params(config)
+    model = MultiHeadDynamics.init(config.model, task, sim_param_names=names, key=key)
+    statistics = Statistics.identity(task, config.model.history_length, names)
+    return Learned(setup.init(model), statistics)
 
 
 def load_learned(run: RunDir, config: Config) -> Learned:
