@@ -17,6 +17,8 @@ Oracle = Literal["independent", "transition", "trajectory"]
 OptimizerName = Literal["cem", "icem", "mppi", "random-shooting"]
 HeadSelection = Literal["adaptive", "average", "random"]
 ModelKind = Literal["multi-headed", "gradient-adapted", "recurrent", "simulator", "none"]
+ContextKind = Literal["learned", "history", "sim-params"]
+ContextPlace = Literal["input", "last-hidden", "head"]
 
 LARGEST = 10**9
 """No number of anything is larger; a file that says so is wrong, or means harm."""
@@ -95,8 +97,13 @@ class ModelConfig:
     """Prediction heads of each network (H)."""
     hidden_sizes: tuple[int, ...] = (200, 200, 200, 200)
     """Widths of the backbone's hidden layers."""
+    context: ContextKind = "learned"
+    """What tells the networks of the hidden physics: `learned` is the context encoder's vector,
+    `history` the encoder's input as it is, `sim-params` the true simulator parameters."""
+    context_at: ContextPlace = "head"
+    """Where the context joins: the networks' `input`, the `last-hidden` layer, or each `head`."""
     context_size: int = 10
-    """Width of the learned context vector; 0 builds no context encoder."""
+    """Width of a `learned` context; 0 builds no context encoder, and the networks see none."""
     context_hidden_sizes: tuple[int, ...] = (256, 128, 64)
     """Widths of the context encoder's hidden layers."""
     history_length: int = 10
@@ -105,6 +112,11 @@ class ModelConfig:
     """Whether a second network predicts backwards in time, to shape the context (A.4)."""
     deterministic: bool = False
     """Whether heads predict a mean only and are fitted to the squared error."""
+    backward_deterministic: bool = False
+    """Whether the backward net is deterministic even where the forward net is not (CaDM)."""
+    relation_head: bool = False
+    """Whether a linear layer learns to tell which contexts come from the same trajectory, and
+    thereby shapes the context (RIA); wants one head and a `learned` context."""
 
     def __post_init__(self):
         problems = _Problems(self)
@@ -118,6 +130,15 @@ class ModelConfig:
             problems.require(
                 plain == PLAIN,
                 f"kind {shown(self.kind)} has {plain}, allowed: {PLAIN}",
+            )
+        problems.one_of("context", typing.get_args(ContextKind))
+        problems.one_of("context_at", typing.get_args(ContextPlace))
+        if self.relation_head:
+            learned = self.context == "learned" and self.context_size > 0
+            problems.require(
+                learned and self.num_heads == 1,
+                f"relation_head with num_heads {self.num_heads}, context {shown(self.context)} and"
+                f" context_size {self.context_size}, allowed: one head and a learned context",
             )
         problems.report()
 
@@ -156,6 +177,14 @@ class FittingConfig:
     `segment` is the plain average (the paper's equation 2)."""
     bootstrap: bool = False
     """Whether each member draws its own samples with replacement (released code, not paper)."""
+    relation_temperature: float = 0.6
+    """Softness of the weights exp(-distance / temperature) with which contexts of different
+    trajectories count as the same where they predict the same (RIA)."""
+    relation_distance_weight: float = 1.0
+    """Weight of the loss that pulls predictions with contexts of one trajectory together (RIA)."""
+    relation_transitions: int = 0
+    """Transitions of a batch on which all its contexts are compared; 0 takes the whole batch, as
+    RIA does. The time of an update grows with it."""
     drop_first_anchor: bool = False
     """Whether the first anchor of every trajectory is left out (a defect of the released code)."""
 
@@ -167,6 +196,8 @@ class FittingConfig:
             0, "warmup_iterations", "backward_weight", "logvar_bound_weight", "weight_decay"
         )
         problems.between(1e-12, 1.0, "learning_rate")
+        problems.between(1e-6, 1e6, "relation_temperature")
+        problems.at_least(0, "relation_distance_weight", "relation_transitions")
         problems.one_of("oracle", typing.get_args(Oracle))
         problems.one_of("reduction", ("head", "segment"))
         problems.report()

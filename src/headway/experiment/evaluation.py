@@ -103,8 +103,8 @@ def evaluate_agent(
     for chunk, start in enumerate(range(0, len(episodes), size)):
         batch = episodes[start : start + size]
         chunk_key = jax.random.fold_in(key, chunk)
-        policy = functools.partial(AgentPolicy, agent, size, key=chunk_key)
         side_by_side = [episode for _, episode in batch]
+        policy = functools.partial(AgentPolicy, agent, size, side_by_side, key=chunk_key)
         if store is None:
             rollout = run_episodes(arena, side_by_side, policy(), on_step)
         else:

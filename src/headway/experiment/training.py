@@ -13,7 +13,7 @@ from jaxtyping import PRNGKeyArray
 
 from headway.config import Config
 from headway.data import ReplayBuffer, Trajectory
-from headway.errors import DivergenceError, RunError
+from headway.errors import RunError
 from headway.experiment import arrays
 from headway.experiment.evaluation import episode_rows, evaluate_agent
 from headway.experiment.interrupts import StopRequest, stop_requests
@@ -39,7 +39,6 @@ from headway.experiment.rollouts import (
 )
 from headway.experiment.runs import RunDir
 from headway.experiment.tensorboard import write_tensorboard
-from headway.models.fitting import EpochStats
 from headway.planning.acting import Acting
 from headway.tasks.base import Task
 from headway.tasks.catalog import env_spec
@@ -163,7 +162,7 @@ class Trainer:
         def policy() -> Policy:
             if iteration == 0:
                 return random_policy(arena, rng)
-            return AgentPolicy(self.agent, num_episodes, key=key)
+            return AgentPolicy(self.agent, num_episodes, episodes, key=key)
 
         self.phase(iteration, "collect")
         advance = self.progress.advance
@@ -294,19 +293,6 @@ def need_of(config: Config) -> MemoryNeed:
     """The memory that training a configuration needs."""
     length = config.collection.episode_length or env_spec(config.env).episode_length
     return memory_need(config, load_task(config), length)
-
-
-def check_epoch(stats: EpochStats, iteration: int, epoch: int) -> None:
-    """Stop a fit that has lost all finite numbers.
-
-    Raises:
-        DivergenceError: No update of the epoch was taken.
-    """
-    if stats.skipped == stats.updates:
-        raise DivergenceError(
-            f"no update of epoch {epoch} of iteration {iteration} had a finite loss and gradient;"
-            " try a smaller fitting.learning_rate."
-        )
 
 
 def initial(config: Config, task: Task) -> Learned:

@@ -20,6 +20,7 @@ from headway.envs.futures import RobotFutures
 from headway.envs.vector_worlds import ClassicVectorEnv, RolloutVectorEnv
 from headway.errors import ConfigError
 from headway.experiment.rollouts import Arena
+from headway.planning.acting import Physics
 from headway.planning.agent import Decision
 from headway.planning.controller import env_action
 from headway.planning.imagination import over_rows
@@ -63,8 +64,13 @@ class SimulatorAgent:
         self._planner = planner
         self.task = simulator.task
 
-    def init(self, num_envs: int, *, key: PRNGKeyArray) -> SimulatorState:
+    sim_param_names = ()  # its simulator knows them
+
+    def init(
+        self, num_envs: int, *, key: PRNGKeyArray, sim_params: Physics | None = None
+    ) -> SimulatorState:
         """See `Acting.init`."""
+        del sim_params
         size = self.task.action_size
         search = make_optimizer(self._planner).init(num_envs, self._planner.horizon, size)
         return SimulatorState(jnp.zeros((num_envs, size)), search, key)

@@ -1,5 +1,6 @@
 """What every agent keeps to, and the agent that acts at random."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -10,6 +11,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.planning.agent import Decision
 from headway.tasks.base import Task
+
+
+Physics = Sequence[Mapping[str, float]]
+"""Simulator parameters of each environment, by name."""
 
 
 @runtime_checkable
@@ -31,8 +36,20 @@ class Acting(Protocol):
         """What the agent knows of the environment."""
         ...
 
-    def init(self, num_envs: int, *, key: PRNGKeyArray) -> Any:
-        """Remember nothing yet; returns an `ActingState`."""
+    @property
+    def sim_param_names(self) -> tuple[str, ...]:
+        """The true simulator parameters that the agent must be told; mostly none."""
+        ...
+
+    def init(self, num_envs: int, *, key: PRNGKeyArray, sim_params: Physics | None = None) -> Any:
+        """Remember nothing yet; returns an `ActingState`.
+
+        Args:
+            num_envs: How many environments.
+            key: The agent's draws.
+            sim_params: The true simulator parameters of each environment, for an agent that is
+                told some.
+        """
         ...
 
     def act(self, state: Any, obs: Float[Array | np.ndarray, "env obs"]) -> tuple[Any, Decision]:
@@ -51,9 +68,13 @@ class RandomAgent(eqx.Module):
     """Draws uniform actions."""
 
     task: Task
+    sim_param_names = ()
 
-    def init(self, num_envs: int, *, key: PRNGKeyArray) -> RandomState:
+    def init(
+        self, num_envs: int, *, key: PRNGKeyArray, sim_params: Physics | None = None
+    ) -> RandomState:
         """See `Acting.init`."""
+        del sim_params
         return RandomState(jnp.zeros((num_envs, self.task.action_size)), key)
 
     def act(

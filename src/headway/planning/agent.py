@@ -1,5 +1,6 @@
 """An agent: recent history, head selection, and a planner around a dynamics model."""
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from headway.config import PlannerConfig
+from headway.data import sim_params_row
 from headway.models.compilation import jit_networks
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.planning.devices import whole_on_each
@@ -28,6 +30,8 @@ class AgentState(NamedTuple):
     acted: Bool[Array, " env"]
     search: SearchState
     key: PRNGKeyArray
+    sim_params: Float[Array, "env sim_param"] | None = None
+    """The true simulator parameters, for a model that is told them."""
 
 
 class Decision(NamedTuple):
@@ -57,8 +61,33 @@ class Agent(eqx.Module):
     planner: PlannerConfig = eqx.field(static=True)
     history_length: int = eqx.field(static=True)
 
-    def init(self, num_envs: int, *, key: PRNGKeyArray) -> AgentState:
-        """Remember nothing yet of `num_envs` environments."""
+    @property
+    def sim_param_names(self) -> tuple[str, ...]:
+        """The true simulator parameters that the model must be told; mostly none."""
+        return self.model.sim_param_names
+
+    def init(
+        self,
+        num_envs: int,
+        *,
+        key: PRNGKeyArray,
+        sim_params: Sequence[Mapping[str, float]] | None = None,
+    ) -> AgentState:
+        """Remember nothing yet of `num_envs` environments.
+
+        Args:
+            num_envs: How many environments.
+            key: The planner's draws.
+            sim_params: The true simulator parameters of each environment. Only a model with
+                `model.context="sim-params"` looks at them.
+
+        Raises:
+            ConfigError: The model is told simulator parameters, and one has no value.
+        """
+        physics, names = None, self.sim_param_names
+        if names:
+            rows = [sim_params_row(row, names) for row in sim_params or [{}]]
+            physics = jnp.broadcast_to(np.stack(rows), (num_envs, len(names)))
         slots = max(self.history_length, self.planner.selection_length)
         action_size = self.task.action_size
         return AgentState(
@@ -68,6 +97,7 @@ class Agent(eqx.Module):
             jnp.zeros(num_envs, bool),
             make_optimizer(self.planner).init(num_envs, self.planner.horizon, action_size),
             key,
+            physics,
         )
 
     def act(
@@ -85,7 +115,7 @@ def _act(
     # 1. Remember the transition that the last action caused.
     recent = state.recent.push(state.obs, state.action, obs, state.acted)
     # 2. Encode the recent past, once per member, for the whole plan.
-    context = encode(agent, recent)
+    context = encode(agent, recent, state.sim_params)
     # 3. Choose the head that best explains the recent past.
     heads = choose_heads(agent, recent, context, error_key=error_key, head_key=head_key)
     # 4. Imagine candidates with it, and search for the best action sequence.
@@ -106,7 +136,8 @@ def _act(
     # 5. Take the first action; where the search ended, one step later, is the next start.
     action = plan.actions[:, 0]
     acted = jnp.ones_like(state.acted)
-    state = AgentState(recent, obs, action, acted, optimizer.shift(plan.state), key)
+    search = optimizer.shift(plan.state)
+    state = AgentState(recent, obs, action, acted, search, key, state.sim_params)
     decision = Decision(action, heads, plan.failures, plan.evaluations)
     return whole_on_each((state, decision), agent.planner.devices)
 
@@ -115,13 +146,18 @@ _act_float32 = jit_networks(_act)
 _act_bfloat16 = jit_networks(_act, precision="bfloat16")
 
 
-def encode(agent: Agent, recent: RecentTransitions) -> Float[Array, "member env context"] | None:
+def encode(
+    agent: Agent,
+    recent: RecentTransitions,
+    sim_params: Float[Array, "env sim_param"] | None = None,
+) -> Float[Array, "member env context"] | None:
     """The context vector of every member and environment."""
     members = agent.model.num_members
-    history = jax.tree.map(
-        lambda x: jnp.broadcast_to(x, (members, *x.shape)), recent.history(agent.history_length)
+    history, sim_params = jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (members, *x.shape)),
+        (recent.history(agent.history_length), sim_params),
     )
-    return agent.model.context(history, agent.statistics)
+    return agent.model.context(history, agent.statistics, sim_params)
 
 
 def choose_heads(

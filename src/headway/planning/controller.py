@@ -1,5 +1,7 @@
 """One robot's controller: observations in, actions out, in the environment's own units."""
 
+from collections.abc import Mapping
+
 import jax
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,11 +25,21 @@ class Controller:
         self._episode = -1
         self.reset()
 
-    def reset(self) -> None:
-        """Forget the past; call it when an episode begins or the physics may have changed."""
+    def reset(self, sim_params: Mapping[str, float] | None = None) -> None:
+        """Forget the past; call it when an episode begins or the physics may have changed.
+
+        Args:
+            sim_params: The true simulator parameters, as in `info["sim_params"]`. Only a model
+                with `model.context="sim-params"` looks at them; it cannot act without.
+
+        Raises:
+            ConfigError: A simulator parameter that the model is told has no value.
+        """
         self._episode += 1
         key = jax.random.fold_in(jax.random.key(self._seed), self._episode)
-        self._state = self.agent.init(1, key=key)
+        self._state = None
+        if sim_params is not None or not self.agent.sim_param_names:
+            self._state = self.agent.init(1, key=key, sim_params=[sim_params or {}])
         self._heads: Int[np.ndarray, " member"] | None = None
 
     def act(self, obs: Float[np.ndarray, " obs"]) -> Float[np.ndarray, " action"]:
@@ -40,8 +52,15 @@ class Controller:
             The action, in the environment's own units and within its bounds.
 
         Raises:
-            ConfigError: The observation has another shape or is not finite.
+            ConfigError: The observation has another shape or is not finite, or the model wants
+                to be told the simulator parameters and was not.
         """
+        if self._state is None:
+            names = ", ".join(self.agent.sim_param_names)
+            raise ConfigError(
+                f"the controller was told no sim_params, allowed: a value for each of {names},"
+                ' which its model takes as input; call reset(sim_params=info["sim_params"]) first.'
+            )
         task = self.agent.task
         obs = np.asarray(obs)
         if obs.shape != (task.obs_size,):

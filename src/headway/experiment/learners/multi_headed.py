@@ -13,6 +13,7 @@ from headway.data import Trajectory
 from headway.experiment.blocks import BlockedData, Layout, fit_blocks
 from headway.experiment.diagnostics import head_shares, prediction_error
 from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
+from headway.experiment.methods import told_sim_params
 from headway.experiment.rollouts import Arena
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitSetup, FitState
@@ -34,15 +35,17 @@ class MultiHeaded(Learner):
 
     def initial(self, key: PRNGKeyArray) -> Learned:
         """See `Learner.initial`."""
-        model = MultiHeadDynamics.init(self.config.model, self.task, key=key)
-        history_length = self.config.model.history_length
-        return Learned(self.setup.init(model), Statistics.identity(self.task, history_length))
+        config, names = self.config.model, told_sim_params(self.config)
+        model = MultiHeadDynamics.init(config, self.task, sim_param_names=names, key=key)
+        statistics = Statistics.identity(self.task, config.history_length, names)
+        return Learned(self.setup.init(model), statistics)
 
     def fit(self, trajectories: list[Trajectory], iteration: int, key: PRNGKeyArray) -> Fit:
         """See `Learner.fit`."""
         model, fitting = self.config.model, self.config.fitting
         data_key, epoch_key = jax.random.split(key)
-        statistics = Statistics.fit(self.task, trajectories, model.history_length)
+        names = self.layout.sim_param_names
+        statistics = Statistics.fit(self.task, trajectories, model.history_length, names)
         data = BlockedData(
             trajectories, self.layout, statistics, self.setup, model.num_members, data_key
         )
