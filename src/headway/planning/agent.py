@@ -9,8 +9,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from headway.config import PlannerConfig
+from headway.errors import ConfigError
 from headway.models.compilation import jit_networks
 from headway.models.dynamics import MultiHeadDynamics, Statistics
+from headway.planning.adaptation import LastLayer, Observed, Prior, Seen, update
 from headway.planning.heads import RecentTransitions, head_errors, select_heads
 from headway.planning.imagination import ImaginedDynamics
 from headway.planning.optimizers import SearchState, make_optimizer, where_env
@@ -27,6 +29,8 @@ class AgentState(NamedTuple):
     acted: Bool[Array, " env"]
     search: SearchState
     key: PRNGKeyArray
+    learned: LastLayer | None = None
+    """What the heads learned in this episode."""
 
 
 class Decision(NamedTuple):
@@ -54,6 +58,15 @@ class Agent(eqx.Module):
     task: Task
     planner: PlannerConfig = eqx.field(static=True)
     history_length: int = eqx.field(static=True)
+    prior: Prior | None = None
+    """Where heads that keep learning start; `prior.fit_prior` finds it."""
+
+    def __check_init__(self):
+        if self.planner.adaptation != "none" and self.prior is None:
+            raise ConfigError(
+                "planner.adaptation is 'last-layer', but the agent has no prior; make it with"
+                " headway.planning.prior.fit_prior, or set planner.adaptation to none."
+            )
 
     def init(self, num_envs: int, *, key: PRNGKeyArray) -> AgentState:
         """Remember nothing yet of `num_envs` environments."""
@@ -66,6 +79,7 @@ class Agent(eqx.Module):
             jnp.zeros(num_envs, bool),
             make_optimizer(self.planner).init(num_envs, self.planner.horizon, action_size),
             key,
+            fresh_layer(self, num_envs),
         )
 
     def act(
@@ -84,15 +98,18 @@ def _act(
     recent = state.recent.push(state.obs, state.action, obs, state.acted)
     # 2. Encode the recent past, once per member, for the whole plan.
     context = encode(agent, recent)
-    # 3. Choose the head that best explains the recent past.
+    # 3. Learn from that transition, where heads keep learning.
+    learned = learn(agent, state.learned, recent, context, state.acted)
+    # 4. Choose the head that best explains the recent past.
     heads = choose_heads(agent, recent, context, error_key=error_key, head_key=head_key)
-    # 4. Imagine candidates with it, and search for the best action sequence.
+    # 5. Imagine candidates with it, and search for the best action sequence.
     dynamics = ImaginedDynamics.fold(
         agent.model,
         agent.statistics,
         planning_heads(agent, heads),
         context,
         precision=agent.planner.precision,
+        correction=None if learned is None else learned.correction(),
     )
     settings = RolloutSettings.of(agent.planner, agent.model.num_members)
 
@@ -101,10 +118,10 @@ def _act(
 
     optimizer = make_optimizer(agent.planner)
     plan = optimizer.optimize(score, state.search, key=plan_key)
-    # 5. Take the first action; where the search ended, one step later, is the next start.
+    # 6. Take the first action; where the search ended, one step later, is the next start.
     action = plan.actions[:, 0]
     acted = jnp.ones_like(state.acted)
-    state = AgentState(recent, obs, action, acted, optimizer.shift(plan.state), key)
+    state = AgentState(recent, obs, action, acted, optimizer.shift(plan.state), key, learned)
     return state, Decision(action, heads, plan.failures, plan.evaluations)
 
 
@@ -119,6 +136,33 @@ def encode(agent: Agent, recent: RecentTransitions) -> Float[Array, "member env 
         lambda x: jnp.broadcast_to(x, (members, *x.shape)), recent.history(agent.history_length)
     )
     return agent.model.context(history, agent.statistics)
+
+
+def fresh_layer(agent: Agent, num_envs: int) -> LastLayer | None:
+    """What heads know of an episode that begins; None where they do not keep learning."""
+    if agent.planner.adaptation == "none" or agent.prior is None:
+        return None
+    _, num_heads, head_size, obs_size = agent.model.forward_net.mean_heads.weight.shape
+    groups = num_heads if agent.planner.adaptation_noise == "heads" else 1
+    sizes = num_heads, head_size + 1, obs_size
+    return LastLayer.of_prior(agent.prior, num_envs, sizes, groups=groups)
+
+
+def learn(
+    agent: Agent,
+    learned: LastLayer | None,
+    recent: RecentTransitions,
+    context: Float[Array, "member env context"] | None,
+    happened: Bool[Array, " env"],
+) -> LastLayer | None:
+    """Learn from the newest transition of every environment."""
+    if learned is None or agent.prior is None:
+        return None
+    newest = recent.obs[:, -1], recent.action[:, -1], recent.next_obs[:, -1]
+    seen = Seen.through(agent.model, agent.task, agent.statistics, newest, context)
+    by_heads = agent.planner.adaptation_noise == "heads"
+    reference = agent.prior.log_reference if by_heads else None
+    return update(learned, Observed.of(seen, happened, reference))
 
 
 def choose_heads(
