@@ -19,6 +19,7 @@ HeadSelection = Literal["adaptive", "average", "random"]
 ModelKind = Literal["multi-headed", "gradient-adapted", "recurrent", "simulator", "none"]
 ContextKind = Literal["learned", "history", "sim-params"]
 ContextPlace = Literal["input", "last-hidden", "head"]
+Adaptation = Literal["none", "last-layer"]
 
 LARGEST = 10**9
 """No number of anything is larger; a file that says so is wrong, or means harm."""
@@ -261,6 +262,15 @@ class PlannerConfig:
     """Whether the newest transition is not used to select heads (released code)."""
     reward: Literal["task", "released"] = "task"
     """The environment's own reward, or the one that the released code plans with."""
+    adaptation: Adaptation = "none"
+    """Whether heads keep learning while they act: `last-layer` corrects their means by Bayesian
+    regression on the episode so far. Its prior comes from the training data."""
+    adaptation_noise: Literal["constant", "heads"] = "constant"
+    """Noise of the transitions that are learned from: the same for all, or in proportion to what
+    each head's own variance says (last-layer)."""
+    adaptation_prior: Literal["owner", "runner-up"] = "owner"
+    """Which head's residuals on the training episodes the prior is fitted to: those of the head
+    that explains an episode best, or second best, as if it were of unseen physics (last-layer)."""
 
     def __post_init__(self):
         problems = _Problems(self)
@@ -282,6 +292,9 @@ class PlannerConfig:
         problems.one_of("particle_noise", ("independent", "shared"))
         problems.one_of("precision", ("float32", "bfloat16"))
         problems.one_of("devices", ("local", "all"))
+        problems.one_of("adaptation", typing.get_args(Adaptation))
+        problems.one_of("adaptation_noise", ("constant", "heads"))
+        problems.one_of("adaptation_prior", ("owner", "runner-up"))
         share = {"icem": 2, "mppi": 0, "random-shooting": 0}.get(self.optimizer, 1)
         problems.require(
             share * self.num_elites <= self.num_candidates,

@@ -96,7 +96,7 @@ class Trainer:
     @property
     def agent(self) -> Acting:
         """The agent as learned so far."""
-        return self.learner.agent(self.learned, self.arena)
+        return self.learner.agent(self.learned, self.arena, self.buffer.trajectories)
 
     def phase(self, iteration: int, name: str) -> None:
         """Announce what comes next."""
@@ -339,7 +339,8 @@ def load_agent(run: RunDir, config: Config | None = None, arena: Arena | None = 
     """
     config = config or run.config()
     learned = load_learned(run, config)
-    return learner_of(config, load_task(config)).agent(learned, arena)
+    trajectories = run.load_data() if config.planner.adaptation != "none" else []
+    return learner_of(config, load_task(config)).agent(learned, arena, trajectories)
 
 
 def load_task(config: Config) -> Task:

@@ -83,10 +83,20 @@ class GaussianNet(eqx.Module):
         context: Float[Array, "member batch context"] | None,
     ) -> Prediction:
         """Predict with every head; results are [member, head, batch, obs]."""
+        return self.predict(self.head_input(x, context))
+
+    def head_input(
+        self,
+        x: Float[Array, "member batch in"],
+        context: Float[Array, "member batch context"] | None,
+    ) -> Float[Array, "member batch hidden"]:
+        """Run the shared hidden layers; where the context joins the heads, it is appended."""
         for index, layer in enumerate(self.hidden):
             x = swish(layer(_joined(x, context) if index == self.context_layer else x))
-        if self.context_layer is None:
-            x = _joined(x, context)
+        return _joined(x, context) if self.context_layer is None else x
+
+    def predict(self, x: Float[Array, "member batch hidden"]) -> Prediction:
+        """Run the heads; results are [member, head, batch, obs]."""
         if self.logvar_heads is None:
             return Prediction(self.mean_heads(x), None)
         low, high = self.min_logvar[:, None, :], self.max_logvar[:, None, :]

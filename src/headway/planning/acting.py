@@ -12,7 +12,6 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from headway.planning.agent import Decision
 from headway.tasks.base import Task
 
-
 Physics = Sequence[Mapping[str, float]]
 """Simulator parameters of each environment, by name."""
 

@@ -78,6 +78,7 @@ class ImaginedDynamics(eqx.Module):
         context: Float[Array, "member env context"] | None,
         *,
         precision: str = "float32",
+        correction: DenseHeads | None = None,
     ) -> "ImaginedDynamics":
         """Fold a model for one plan.
 
@@ -88,6 +89,7 @@ class ImaginedDynamics(eqx.Module):
             context: The context vector of each member and environment.
             precision: Of the products' inputs, `float32` or `bfloat16`. The first layer stays
                 in float32: it takes raw observations, whose offsets bfloat16 would not resolve.
+            correction: Added to the mean heads, with a leading environment axis (`adaptation`).
         """
         net = model.forward_net
         dtype = PRECISIONS[precision]
@@ -101,7 +103,7 @@ class ImaginedDynamics(eqx.Module):
             place, context = net.context_layer, None
             context_bias = hidden[place].bias + shift
         delta = statistics.delta
-        mean_weight, mean_bias = _chosen(net.mean_heads, heads, context)
+        mean_weight, mean_bias = _chosen(net.mean_heads, heads, context, correction)
         weights = [mean_weight.mean(2) * delta.std]
         biases = [mean_bias.mean(2) * delta.std + delta.mean]
         low = high = None
@@ -229,10 +231,15 @@ def _chosen(
     layer: DenseHeads,
     heads: Int[Array, "env member choice"],
     context: Float[Array, "member env context"] | None,
+    correction: DenseHeads | None = None,
 ) -> tuple[Float[Array, "env member choice hidden obs"], Float[Array, "env member choice obs"]]:
     """Weights and biases of the chosen heads, the context added to the biases."""
     member = jnp.arange(heads.shape[1])[:, None]
     weight, bias = layer.weight[member, heads], layer.bias[member, heads]
+    if correction is not None:
+        env = jnp.arange(len(heads))[:, None, None]
+        weight = weight + correction.weight[env, member, heads]
+        bias = bias + correction.bias[env, member, heads]
     if context is None:
         return weight, bias
     hidden_size = weight.shape[-2] - context.shape[-1]

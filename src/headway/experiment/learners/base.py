@@ -62,12 +62,18 @@ class Learner(abc.ABC):
         """Prepare to fit everything collected so far; the key alone decides what is drawn."""
 
     @abc.abstractmethod
-    def agent(self, learned: Learned, arena: Arena | None = None) -> Acting:
+    def agent(
+        self,
+        learned: Learned,
+        arena: Arena | None = None,
+        trajectories: Sequence[Trajectory] = (),
+    ) -> Acting:
         """The agent that acts with what was learned.
 
         Args:
             learned: What was learned.
             arena: Where it acts, if that is known; only the simulator asks.
+            trajectories: What it was learned from; only heads that keep learning ask.
         """
 
     def head_shares(

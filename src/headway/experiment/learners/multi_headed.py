@@ -1,5 +1,6 @@
 """Ensembles of multi-headed networks: T-MCL and all that is expressed by its settings."""
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 from contextlib import closing
@@ -18,6 +19,7 @@ from headway.experiment.rollouts import Arena
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitSetup, FitState
 from headway.planning.agent import Agent
+from headway.planning.prior import fit_prior
 
 
 class MultiHeaded(Learner):
@@ -64,26 +66,43 @@ class MultiHeaded(Learner):
 
         return Fit(statistics, epochs)
 
-    def agent(self, learned: Learned, arena: Arena | None = None) -> Agent:
+    def agent(
+        self,
+        learned: Learned,
+        arena: Arena | None = None,
+        trajectories: Sequence[Trajectory] = (),
+    ) -> Agent:
         """See `Learner.agent`."""
         del arena
-        config = self.config
-        return Agent(
-            learned.fit.model,
-            learned.statistics,
-            self.task,
-            config.planner,
-            config.model.history_length,
-        )
+        model, statistics = learned.fit.model, learned.statistics
+        planner, history_length = self.config.planner, self.config.model.history_length
+        prior = None
+        if planner.adaptation != "none":
+            prior = fit_prior(
+                model,
+                self.task,
+                statistics,
+                trajectories,
+                history_length=history_length,
+                head_noise=planner.adaptation_noise == "heads",
+                rank=planner.adaptation_prior,
+            )
+        return Agent(model, statistics, self.task, planner, history_length, prior)
+
+    def frozen(self, learned: Learned) -> Agent:
+        """The agent whose heads stay as they were fitted."""
+        planner = dataclasses.replace(self.config.planner, adaptation="none")
+        model, length = learned.fit.model, self.config.model.history_length
+        return Agent(model, learned.statistics, self.task, planner, length)
 
     def head_shares(
         self, learned: Learned, trajectories: list[Trajectory]
     ) -> Sequence[dict[str, Any]]:
         """See `Learner.head_shares`."""
-        return head_shares(self.agent(learned), self.setup, self.layout.in_order(trajectories))
+        return head_shares(self.frozen(learned), self.setup, self.layout.in_order(trajectories))
 
     def prediction_error(
         self, learned: Learned, trajectories: list[Trajectory], key: PRNGKeyArray
     ) -> Float[np.ndarray, " step"]:
         """See `Learner.prediction_error`."""
-        return prediction_error(self.agent(learned), trajectories, key=key)
+        return prediction_error(self.frozen(learned), trajectories, key=key)

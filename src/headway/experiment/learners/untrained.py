@@ -1,5 +1,7 @@
 """What learns nothing: random actions, and planning on the simulator itself."""
 
+from collections.abc import Sequence
+
 from jaxtyping import PRNGKeyArray
 
 from headway.data import Trajectory
@@ -32,22 +34,32 @@ class Untrained(Learner):
 class Random(Untrained):
     """Uniform random actions."""
 
-    def agent(self, learned: Learned, arena: Arena | None = None) -> Acting:
+    def agent(
+        self,
+        learned: Learned,
+        arena: Arena | None = None,
+        trajectories: Sequence[Trajectory] = (),
+    ) -> Acting:
         """See `Learner.agent`."""
-        del learned, arena
+        del learned, arena, trajectories
         return RandomAgent(self.task)
 
 
 class Simulator(Untrained):
     """The planner on the true dynamics."""
 
-    def agent(self, learned: Learned, arena: Arena | None = None) -> Acting:
+    def agent(
+        self,
+        learned: Learned,
+        arena: Arena | None = None,
+        trajectories: Sequence[Trajectory] = (),
+    ) -> Acting:
         """See `Learner.agent`.
 
         Raises:
             ConfigError: No arena is given, or its simulator cannot be planned with.
         """
-        del learned
+        del learned, trajectories
         if arena is None:
             raise ConfigError(
                 "a run on the true dynamics has no controller of its own, allowed: testing it in"
