@@ -38,10 +38,14 @@ def planners(own: PlannerConfig, num_members: int) -> dict[str, Settings]:
         own: What the run was trained with.
         num_members: Networks in the ensemble, each of which imagines at least one particle.
     """
+    paper = size_of(PlannerConfig())
+    fast = {"num_candidates": 100, "num_elites": 20, "num_iterations": 3}
     half_iterations = {"num_iterations": (own.num_iterations + 1) // 2}
     warm = {"warm_variance": True}
     return {
         "cem": {},
+        "paper": paper,
+        "paper, fast": paper | fast | {"num_particles": num_members},
         "cem, 1/2 of the candidates": fewer(own, 2),
         "cem, 1/4 of the candidates": fewer(own, 4),
         "cem, half the iterations": half_iterations,
@@ -60,6 +64,12 @@ def planners(own: PlannerConfig, num_members: int) -> dict[str, Settings]:
         "mppi, 1/4 of the candidates": {"optimizer": "mppi"} | fewer(own, 4),
         "random-shooting": {"optimizer": "random-shooting"},
     }
+
+
+def size_of(planner: PlannerConfig) -> Settings:
+    """What decides how much a plan computes."""
+    names = ("horizon", "num_candidates", "num_elites", "num_iterations", "num_particles")
+    return {name: getattr(planner, name) for name in names}
 
 
 def fewer(own: PlannerConfig, share: int) -> Settings:
