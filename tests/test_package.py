@@ -146,3 +146,13 @@ def test_links_lead_somewhere(page):
         assert file.exists(), f"{page.name} links to {target}, which is not there"
         if anchor:
             assert anchor in anchors(file), f"{page.name} links to {target}: no such heading"
+
+
+def test_no_file_holds_the_marks_of_an_unfinished_merge():
+    marks = tuple(mark * 7 + " " for mark in "<>")
+    folders = ("src", "tests", "docs", "benchmarks", "results", "examples")
+    pages = [page for folder in folders for page in (ROOT / folder).rglob("*")]
+    for page in [*pages, *ROOT.glob("*")]:
+        if page.suffix in {".py", ".md", ".toml", ".txt", ".csv", ".json"}:
+            marked = [line for line in page.read_text().splitlines() if line.startswith(marks)]
+            assert not marked, f"{page} holds the marks of an unfinished merge: {marked}"

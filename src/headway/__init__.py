@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from headway.planning.optimizers import MPPI as MPPI
     from headway.planning.optimizers import RandomShooting as RandomShooting
     from headway.report.dynamics import plot_dynamics as plot_dynamics
+    from headway.report.page.build import write_report as write_report
     from headway.sim_params import SimParamSets as SimParamSets
     from headway.tasks.base import Task as Task
     from headway.tasks.catalog import EnvSpec as EnvSpec
@@ -68,6 +69,7 @@ _HOME = {
     "planning.controller": ("Controller",),
     "planning.optimizers": ("CEM", "ICEM", "MPPI", "RandomShooting"),
     "report.dynamics": ("plot_dynamics",),
+    "report.page.build": ("write_report",),
     "sim_params": ("SimParamSets",),
     "tasks.base": ("Task",),
     "tasks.catalog": ("EnvSpec", "env_spec", "register"),

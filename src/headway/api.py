@@ -140,8 +140,8 @@ def evaluate(
         changes["evaluation.num_episodes"] = num_episodes
     config = config_to_evaluate(run.config(), changes)
     check_memory(need_of(config).to_test)
-    agent = load_agent(run, config)
     arena = Arena.make(config)
+    agent = load_agent(run, config, arena)
     known = arena.sim_params.group_names
     for group in groups or ():
         if group not in known:

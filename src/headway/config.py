@@ -16,11 +16,23 @@ from headway.sim_params import SimParamSets
 Oracle = Literal["independent", "transition", "trajectory"]
 OptimizerName = Literal["cem", "icem", "mppi", "random-shooting"]
 HeadSelection = Literal["adaptive", "average", "random"]
+ModelKind = Literal["multi-headed", "gradient-adapted", "recurrent", "simulator", "none"]
+ContextKind = Literal["learned", "history", "sim-params"]
+ContextPlace = Literal["input", "last-hidden", "head"]
+Adaptation = Literal["none", "last-layer"]
 
 LARGEST = 10**9
 """No number of anything is larger; a file that says so is wrong, or means harm."""
 MAX_LAYERS = 64
 """Hidden layers of a network."""
+PLAIN: Mapping[str, Any] = {
+    "num_members": 1,
+    "num_heads": 1,
+    "context_size": 0,
+    "backward_net": False,
+    "deterministic": True,
+}
+"""Settings of every kind of model that is no multi-headed ensemble."""
 
 
 class _Problems:
@@ -73,16 +85,26 @@ class _Problems:
 
 @dataclasses.dataclass(frozen=True)
 class ModelConfig:
-    """The dynamics model: an ensemble of multi-headed networks (supplement A.3)."""
+    """The dynamics model: by default an ensemble of multi-headed networks (supplement A.3)."""
 
+    kind: ModelKind = "multi-headed"
+    """What predicts: an ensemble of multi-headed networks; one network that a gradient step
+    adapts to the newest transitions (GrBAL); a recurrent one (ReBAL); the simulator itself; or
+    nothing, and actions are random. All but the first have one member, one head, no context and
+    no variance."""
     num_members: int = 5
     """Networks in the ensemble."""
     num_heads: int = 3
     """Prediction heads of each network (H)."""
     hidden_sizes: tuple[int, ...] = (200, 200, 200, 200)
     """Widths of the backbone's hidden layers."""
+    context: ContextKind = "learned"
+    """What tells the networks of the hidden physics: `learned` is the context encoder's vector,
+    `history` the encoder's input as it is, `sim-params` the true simulator parameters."""
+    context_at: ContextPlace = "head"
+    """Where the context joins: the networks' `input`, the `last-hidden` layer, or each `head`."""
     context_size: int = 10
-    """Width of the learned context vector; 0 builds no context encoder."""
+    """Width of a `learned` context; 0 builds no context encoder, and the networks see none."""
     context_hidden_sizes: tuple[int, ...] = (256, 128, 64)
     """Widths of the context encoder's hidden layers."""
     history_length: int = 10
@@ -91,6 +113,11 @@ class ModelConfig:
     """Whether a second network predicts backwards in time, to shape the context (A.4)."""
     deterministic: bool = False
     """Whether heads predict a mean only and are fitted to the squared error."""
+    backward_deterministic: bool = False
+    """Whether the backward net is deterministic even where the forward net is not (CaDM)."""
+    relation_head: bool = False
+    """Whether a linear layer learns to tell which contexts come from the same trajectory, and
+    thereby shapes the context (RIA); wants one head and a `learned` context."""
 
     def __post_init__(self):
         problems = _Problems(self)
@@ -98,6 +125,22 @@ class ModelConfig:
         problems.at_least(0, "context_size")
         problems.sizes("hidden_sizes")
         problems.sizes("context_hidden_sizes")
+        problems.one_of("kind", typing.get_args(ModelKind))
+        if self.kind != "multi-headed":
+            plain = {name: getattr(self, name) for name in PLAIN}
+            problems.require(
+                plain == PLAIN,
+                f"kind {shown(self.kind)} has {plain}, allowed: {PLAIN}",
+            )
+        problems.one_of("context", typing.get_args(ContextKind))
+        problems.one_of("context_at", typing.get_args(ContextPlace))
+        if self.relation_head:
+            learned = self.context == "learned" and self.context_size > 0
+            problems.require(
+                learned and self.num_heads == 1,
+                f"relation_head with num_heads {self.num_heads}, context {shown(self.context)} and"
+                f" context_size {self.context_size}, allowed: one head and a learned context",
+            )
         problems.report()
 
 
@@ -135,6 +178,14 @@ class FittingConfig:
     `segment` is the plain average (the paper's equation 2)."""
     bootstrap: bool = False
     """Whether each member draws its own samples with replacement (released code, not paper)."""
+    relation_temperature: float = 0.6
+    """Softness of the weights exp(-distance / temperature) with which contexts of different
+    trajectories count as the same where they predict the same (RIA)."""
+    relation_distance_weight: float = 1.0
+    """Weight of the loss that pulls predictions with contexts of one trajectory together (RIA)."""
+    relation_transitions: int = 0
+    """Transitions of a batch on which all its contexts are compared; 0 takes the whole batch, as
+    RIA does. The time of an update grows with it."""
     drop_first_anchor: bool = False
     """Whether the first anchor of every trajectory is left out (a defect of the released code)."""
 
@@ -146,6 +197,8 @@ class FittingConfig:
             0, "warmup_iterations", "backward_weight", "logvar_bound_weight", "weight_decay"
         )
         problems.between(1e-12, 1.0, "learning_rate")
+        problems.between(1e-6, 1e6, "relation_temperature")
+        problems.at_least(0, "relation_distance_weight", "relation_transitions")
         problems.one_of("oracle", typing.get_args(Oracle))
         problems.one_of("reduction", ("head", "segment"))
         problems.report()
@@ -195,6 +248,9 @@ class PlannerConfig:
     and candidates are compared under equal luck."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """What the networks multiply while planning; sums and states are always float32."""
+    devices: Literal["local", "all"] = "local"
+    """Which devices share the candidates: those of this process, or of all processes that
+    `jax.distributed` joins, which must then all act alike, step by step."""
     head_selection: HeadSelection = "adaptive"
     """Which head plans: the best on recent transitions, their average, or a random one."""
     selection_length: int = 10
@@ -206,6 +262,15 @@ class PlannerConfig:
     """Whether the newest transition is not used to select heads (released code)."""
     reward: Literal["task", "released"] = "task"
     """The environment's own reward, or the one that the released code plans with."""
+    adaptation: Adaptation = "none"
+    """Whether heads keep learning while they act: `last-layer` corrects their means by Bayesian
+    regression on the episode so far. Its prior comes from the training data."""
+    adaptation_noise: Literal["constant", "heads"] = "constant"
+    """Noise of the transitions that are learned from: the same for all, or in proportion to what
+    each head's own variance says (last-layer)."""
+    adaptation_prior: Literal["owner", "runner-up"] = "owner"
+    """Which head's residuals on the training episodes the prior is fitted to: those of the head
+    that explains an episode best, or second best, as if it were of unseen physics (last-layer)."""
 
     def __post_init__(self):
         problems = _Problems(self)
@@ -226,6 +291,10 @@ class PlannerConfig:
         problems.one_of("reward", ("task", "released"))
         problems.one_of("particle_noise", ("independent", "shared"))
         problems.one_of("precision", ("float32", "bfloat16"))
+        problems.one_of("devices", ("local", "all"))
+        problems.one_of("adaptation", typing.get_args(Adaptation))
+        problems.one_of("adaptation_noise", ("constant", "heads"))
+        problems.one_of("adaptation_prior", ("owner", "runner-up"))
         share = {"icem": 2, "mppi": 0, "random-shooting": 0}.get(self.optimizer, 1)
         problems.require(
             share * self.num_elites <= self.num_candidates,
@@ -313,5 +382,10 @@ class Config:
             self.planner.num_particles % self.model.num_members == 0,
             f"planner.num_particles is {self.planner.num_particles}, allowed: a multiple of"
             f" model.num_members ({self.model.num_members})",
+        )
+        problems.require(
+            self.model.kind != "simulator" or self.planner.num_particles == 1,
+            f"planner.num_particles is {self.planner.num_particles}, allowed: 1, because the"
+            " simulator has no noise",
         )
         problems.report()

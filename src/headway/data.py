@@ -50,6 +50,23 @@ class Trajectory:
         return len(self.action)
 
 
+def sim_params_row(
+    sim_params: Mapping[str, float], names: tuple[str, ...]
+) -> Float[np.ndarray, " sim_param"]:
+    """Simulator parameters in a fixed order.
+
+    Raises:
+        ConfigError: A parameter has no value.
+    """
+    missing = [name for name in names if name not in sim_params]
+    if missing:
+        raise ConfigError(
+            f"sim_params {dict(sim_params)} lack {', '.join(missing)}, allowed: a value for each of"
+            f" {', '.join(names)}, which the model takes as input."
+        )
+    return np.array([sim_params[name] for name in names], np.float32)
+
+
 class History(NamedTuple):
     """The last K transitions before a step, filled from the left, zeros on the right."""
 
@@ -76,22 +93,32 @@ class Episodes(eqx.Module):
     action: Float[Array, "episode time action"]
     length: Int[Array, " episode"]
     count: Int[Array, ""]
+    sim_params: Float[Array, "episode sim_param"]
+    """The true simulator parameters that a model is told; of width 0 where it is told none."""
 
     @classmethod
-    def pad(cls, trajectories: list[Trajectory], capacity: int, max_length: int) -> "Episodes":
+    def pad(
+        cls,
+        trajectories: list[Trajectory],
+        capacity: int,
+        max_length: int,
+        sim_param_names: tuple[str, ...] = (),
+    ) -> "Episodes":
         """Lay trajectories out in arrays of fixed shape, repeating the last observation."""
         first = trajectories[0]
         obs = np.zeros((capacity, max_length + 1, first.obs.shape[1]), np.float32)
         action = np.zeros((capacity, max_length, first.action.shape[1]), np.float32)
         length = np.zeros(capacity, np.int32)
+        sim_params = np.zeros((capacity, len(sim_param_names)), np.float32)
         for row, trajectory in enumerate(trajectories):
             steps = len(trajectory)
+            sim_params[row] = sim_params_row(trajectory.sim_params, sim_param_names)
             obs[row, : steps + 1] = trajectory.obs
             obs[row, steps + 1 :] = trajectory.obs[-1]
             action[row, :steps] = trajectory.action
             length[row] = steps
         count = jnp.asarray(len(trajectories), jnp.int32)
-        return cls(jnp.asarray(obs), jnp.asarray(action), jnp.asarray(length), count)
+        return cls(*map(jnp.asarray, (obs, action, length, count, sim_params)))
 
     def history(
         self, episode: Int[Array, "*batch"], step: Int[Array, "*batch"], length: int

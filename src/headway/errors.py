@@ -32,6 +32,10 @@ class RunError(HeadwayError, RuntimeError):
     """A run directory is missing, damaged, or belongs to another configuration."""
 
 
+class BusyError(RunError):
+    """Another process holds the run directory."""
+
+
 class DivergenceError(HeadwayError, ArithmeticError):
     """Fitting produced non-finite numbers that could not be repaired."""
 

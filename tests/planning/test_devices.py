@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -35,6 +36,18 @@ def actions(agent, num_envs=3, steps=3):
     return np.stack(found)
 
 
+def python(program, *args):
+    """A Python that can import what the tests can."""
+    paths = [str(Path(toys.__file__).parent), *sys.path]
+    return subprocess.Popen(
+        [sys.executable, "-c", program, *args],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
 PROGRAM = """
 import json, sys, jax
 jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
@@ -49,20 +62,47 @@ print(len(state.search.guess.sharding.device_set))
 
 @pytest.mark.parametrize("settings", [{}, {"particle_noise": "shared"}, {"num_candidates": 42}])
 def test_four_devices_choose_the_actions_of_one(settings):
-    paths = [str(Path(toys.__file__).parent), *sys.path]
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, "4", json.dumps(settings)],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    found, num_devices = done.stdout.splitlines()[-2:]
+    worker = python(PROGRAM, "4", json.dumps(settings))
+    out, errors = worker.communicate()
+    assert worker.returncode == 0, errors[-2000:]
+    found, num_devices = out.splitlines()[-2:]
     shared = settings.get("num_candidates", 40) % 4 == 0
     assert int(num_devices) == (4 if shared else 1)
     four = np.array(json.loads(found))
     np.testing.assert_allclose(four, actions(make_agent(**settings)), atol=1e-5)
+
+
+SHARED_PROGRAM = """
+import json, sys, jax
+jax.config.update("jax_cpu_collectives_implementation", "gloo")
+jax.distributed.initialize(sys.argv[1], num_processes=2, process_id=int(sys.argv[2]))
+from planning import test_devices
+agent = test_devices.make_agent(**json.loads(sys.argv[3]))
+found = test_devices.actions(agent).tolist()
+_, decision = agent.act(agent.init(1, key=jax.random.key(0)), [[0.0, 0.0]])
+print(json.dumps([len(jax.local_devices()), len(decision.action.sharding.device_set), found]))
+"""
+
+
+@pytest.mark.parametrize("optimizer", ["cem", "mppi"])
+def test_two_processes_that_share_a_plan_choose_the_actions_of_one(optimizer):
+    settings = json.dumps({"optimizer": optimizer, "devices": "all"})
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        address = f"localhost:{free.getsockname()[1]}"
+    workers = [python(SHARED_PROGRAM, address, str(process), settings) for process in (0, 1)]
+    try:
+        answers = [worker.communicate(timeout=120) for worker in workers]
+    finally:
+        for worker in workers:
+            worker.kill()
+    for worker, (_, errors) in zip(workers, answers, strict=True):
+        assert worker.returncode == 0, errors[-2000:]
+    alone = actions(make_agent(optimizer=optimizer))
+    for out, _ in answers:
+        own, sharing, found = json.loads(out.splitlines()[-1])
+        assert (own, sharing) == (1, 2)
+        np.testing.assert_allclose(np.array(found), alone, atol=1e-5)
 
 
 def test_reduced_precision_chooses_nearly_the_same_actions():

@@ -13,6 +13,7 @@ from headway import __version__
 from headway.cli.usage import UsageError, closest, one_line
 from headway.errors import HeadwayError
 
+RESUMABLE = ("train", "reproduce", "sweep")
 TERMINATED = 143  # as a shell reports SIGTERM
 
 HELP = """\
@@ -23,7 +24,11 @@ Control that keeps making headway when the physics changes.
 commands:
   train ENV           train a controller on an environment whose physics vary
   evaluate RUN        test a trained run on training and unseen physics
-  list WHAT           list envs, methods or presets
+  diagnose RUN        measure how well a trained run selects heads
+  report RUN ...      compare runs on one HTML page
+  reproduce NAME      run what is missing of an experiment of the paper, and draw it
+  sweep               run methods, settings, environments and seeds with each other
+  list WHAT           list envs, methods, presets or experiments
   plot-dynamics ENV   draw what an action leads to under each physics
 
 options:
@@ -94,7 +99,7 @@ def _describe(error: OSError) -> str:
 
 def _say_stopped(how: str, words: list[str]) -> None:
     advice = "; the same command goes on where this one stopped"
-    print(f"{how}{advice if words[:1] == ['train'] else ''}", file=sys.stderr)
+    print(f"{how}{advice if words[:1] in ([name] for name in RESUMABLE) else ''}", file=sys.stderr)
 
 
 def _leave(code: int) -> NoReturn:

@@ -153,13 +153,47 @@ class Evaluate:
 
 
 @dataclasses.dataclass(frozen=True)
+class Report:
+    """Compare runs on one HTML page that needs nothing else: no network, no other file."""
+
+    runs: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN [RUN ...]")]
+    """Run directories, or folders that hold some; any methods, environments and seeds."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("report.html")
+    """The HTML file to write."""
+    only: Annotated[tuple[str, ...], _unset("all of them")] = ()
+    """Chapters to make, for example `learning-curves` or `contexts`."""
+    json: Flag = False
+    """Print one JSON line on stdout instead of text."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnose:
+    """Measure how well a trained run selects heads, and how well it knows its own error.
+
+    Its own test episodes are run again, with fixed seeds; nothing in its directory changes.
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """The run directory."""
+    group: Annotated[tuple[str, ...], _unset("all of them")] = ()
+    """Groups of physics: `train` or unseen groups."""
+    episodes: Annotated[int | None, _unset("as in the run's own tests")] = None
+    """Episodes per group."""
+    json: Flag = False
+    """Print one JSON line on stdout instead of tables."""
+    quiet: Flag = False
+    """Show no progress."""
+
+
+@dataclasses.dataclass(frozen=True)
 class List:
     """List what can be named on the command line."""
 
     what: Annotated[
-        tyro.conf.Positional[Literal["envs", "methods", "presets"]], tyro.conf.arg(metavar="WHAT")
+        tyro.conf.Positional[Literal["envs", "methods", "presets", "experiments"]],
+        tyro.conf.arg(metavar="WHAT"),
     ]
-    """envs, methods or presets."""
+    """envs, methods, presets or experiments."""
     json: Flag = False
     """Print one JSON line on stdout instead of a table."""
 

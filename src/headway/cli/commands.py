@@ -1,9 +1,7 @@
 """One function per command: parse, call the library, print."""
 
 import dataclasses
-import json
 import shlex
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +16,10 @@ from headway.cli.arguments import (
     WithSettings,
     changed_settings,
 )
+from headway.cli.comparisons import reproduce, sweep
+from headway.cli.output import print_json as _print_json
+from headway.cli.output import print_tables as _print_tables
+from headway.cli.reports import report
 from headway.cli.usage import UsageError, parse, wants_help
 from headway.config import Config
 from headway.errors import ConfigError, unknown_name
@@ -27,7 +29,6 @@ if TYPE_CHECKING:
     from headway.experiment.tables import EpisodeRow
     from headway.tasks.catalog import EnvSpec
 
-PIPE_WIDTH = 130
 MAX_SIM_PARAMS_BYTES = 2**20
 
 
@@ -101,9 +102,10 @@ def evaluate(words: Sequence[str]) -> int:
 def list_names(words: Sequence[str]) -> int:
     """`headway list`."""
     arguments = parse(List, List(what=tyro.MISSING), words, "headway list")
-    from headway.report import tables
+    from headway.report import comparison_tables, tables
 
     found = {"envs": tables.envs, "methods": tables.methods, "presets": tables.presets}
+    found["experiments"] = comparison_tables.experiments
     entries, table = found[arguments.what]()
     if arguments.json:
         return _print_json({arguments.what: entries})
@@ -132,8 +134,11 @@ def plot_dynamics(words: Sequence[str]) -> int:
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "train": train,
     "evaluate": evaluate,
+    "reproduce": reproduce,
+    "sweep": sweep,
     "list": list_names,
     "plot-dynamics": plot_dynamics,
+    "report": report,
 }
 
 
@@ -251,16 +256,3 @@ def _print_cost(cost: "PlanningCost") -> None:
     time = "" if cost.seconds_per_step is None else f", {1e3 * cost.seconds_per_step:.3g} ms"
     candidates = f"{cost.evaluations_per_step:,.0f} candidates"
     print(f"Planning took {candidates}, {cost.flop_per_step / 1e9:.3g} GFLOP{time} per step.")
-
-
-def _print_tables(*tables: Any) -> None:
-    from rich.console import Console
-
-    console = Console(width=None if sys.stdout.isatty() else PIPE_WIDTH, highlight=False)
-    for table in tables:
-        console.print(table)
-
-
-def _print_json(facts: dict[str, Any]) -> int:
-    print(json.dumps(facts, allow_nan=False))
-    return 0

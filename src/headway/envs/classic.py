@@ -1,4 +1,8 @@
-"""CartPoleSwingUp and Pendulum: equations of motion in NumPy."""
+"""CartPoleSwingUp and Pendulum: equations of motion, for NumPy and for JAX.
+
+The environments step them in NumPy's float64; a planner that knows the true dynamics compiles
+them (`xp=jax.numpy`).
+"""
 
 import abc
 from collections.abc import Mapping
@@ -37,8 +41,14 @@ class ClassicWorld(World):
         """Make one step from `state` [..., state] with `action` [..., action]."""
 
     @abc.abstractmethod
-    def observe(self, state: np.ndarray) -> np.ndarray:
-        """Return the observation [..., obs] of a state."""
+    def next_state(
+        self, state: Any, action: Any, sim_params: Mapping[str, Any], xp: Any = np
+    ) -> Any:
+        """The state [..., state] after a step, by `numpy` or by `jax.numpy`."""
+
+    @abc.abstractmethod
+    def observe(self, state: Any, xp: Any = np) -> Any:
+        """Return the observation [..., obs] of a state, by `numpy` or by `jax.numpy`."""
 
     @abc.abstractmethod
     def draw_frame(
@@ -71,28 +81,33 @@ class CartPoleWorld(ClassicWorld):
 
     def advance(self, state: np.ndarray, action: np.ndarray, sim_params: Mapping[str, Any]) -> Step:
         """Positions advance with the old velocities."""
-        scale = sim_params["mass_scale"]
-        m, total = self.pole_mass * scale, (self.pole_mass + self.cart_mass) * scale
-        g, length = self.gravity, self.pole_length
-        _, v, angle, spin = np.moveaxis(state, -1, 0)
-        sin, cos = np.sin(angle), np.cos(angle)
-        push = self.force * action[..., 0] - self.friction * v
-        swing = m * length * np.square(spin) * sin
-        v_dot = (-2 * swing + 3 * m * g * sin * cos + 4 * push) / (4 * total - 3 * m * cos * cos)
-        spin_dot = (-3 * swing * cos + 6 * total * g * sin + 6 * push * cos) / (
-            4 * length * total - 3 * m * length * cos * cos
-        )
-        rates = np.stack([v, v_dot, spin, spin_dot], axis=-1)
-        after = state + self.time_step * rates
+        after = self.next_state(state, action, sim_params)
         obs = self.observe(after)
         reward = 0.5 * (1.0 + obs[..., 2].astype(np.float64))
         off_track = np.abs(obs[..., 0]) > np.float32(TRACK_LIMIT)
         return Step(after, reward, off_track & self.terminate_off_track)
 
-    def observe(self, state: np.ndarray) -> np.ndarray:
+    def next_state(
+        self, state: Any, action: Any, sim_params: Mapping[str, Any], xp: Any = np
+    ) -> Any:
+        """See `ClassicWorld.next_state`."""
+        scale = sim_params["mass_scale"]
+        m, total = self.pole_mass * scale, (self.pole_mass + self.cart_mass) * scale
+        g, length = self.gravity, self.pole_length
+        _, v, angle, spin = xp.moveaxis(state, -1, 0)
+        sin, cos = xp.sin(angle), xp.cos(angle)
+        push = self.force * action[..., 0] - self.friction * v
+        swing = m * length * xp.square(spin) * sin
+        v_dot = (-2 * swing + 3 * m * g * sin * cos + 4 * push) / (4 * total - 3 * m * cos * cos)
+        spin_dot = (-3 * swing * cos + 6 * total * g * sin + 6 * push * cos) / (
+            4 * length * total - 3 * m * length * cos * cos
+        )
+        return state + self.time_step * xp.stack([v, v_dot, spin, spin_dot], axis=-1)
+
+    def observe(self, state: Any, xp: Any = np) -> Any:
         """Return x, ẋ, cos θ, sin θ, θ̇."""
-        x, v, angle, spin = np.moveaxis(state, -1, 0)
-        return np.stack([x, v, np.cos(angle), np.sin(angle), spin], -1).astype(np.float32)
+        x, v, angle, spin = xp.moveaxis(state, -1, 0)
+        return xp.stack([x, v, xp.cos(angle), xp.sin(angle), spin], -1).astype(np.float32)
 
     def draw_frame(
         self, state: np.ndarray, action: np.ndarray, sim_params: Mapping[str, float]
@@ -127,20 +142,28 @@ class PendulumWorld(ClassicWorld):
         """The angle advances with the new speed before that is clipped."""
         angle, spin = np.moveaxis(state, -1, 0)
         torque = action[..., 0]
-        mass, length = sim_params["mass"], sim_params["length"]
         wrapped = np.mod(angle + np.pi, 2 * np.pi) - np.pi
         cost = np.square(wrapped) + 0.1 * np.square(spin) + 0.001 * np.square(torque)
-        inertia = mass * np.square(length)
-        spin_dot = 1.5 * self.gravity / length * np.sin(angle) + 3.0 * torque / inertia
+        after = self.next_state(state, action, sim_params)
+        return Step(after, -cost, np.zeros(cost.shape, bool))
+
+    def next_state(
+        self, state: Any, action: Any, sim_params: Mapping[str, Any], xp: Any = np
+    ) -> Any:
+        """See `ClassicWorld.next_state`."""
+        angle, spin = xp.moveaxis(state, -1, 0)
+        mass, length = sim_params["mass"], sim_params["length"]
+        inertia = mass * xp.square(length)
+        spin_dot = 1.5 * self.gravity / length * xp.sin(angle) + 3.0 * action[..., 0] / inertia
         new_spin = spin + spin_dot * self.time_step
         new_angle = angle + new_spin * self.time_step
-        new_spin = np.clip(new_spin, -self.max_speed, self.max_speed)
-        return Step(np.stack([new_angle, new_spin], -1), -cost, np.zeros(cost.shape, bool))
+        new_spin = xp.clip(new_spin, -self.max_speed, self.max_speed)
+        return xp.stack([new_angle, new_spin], -1)
 
-    def observe(self, state: np.ndarray) -> np.ndarray:
+    def observe(self, state: Any, xp: Any = np) -> Any:
         """Return cos θ, sin θ, θ̇."""
-        angle, spin = np.moveaxis(state, -1, 0)
-        return np.stack([np.cos(angle), np.sin(angle), spin], axis=-1).astype(np.float32)
+        angle, spin = xp.moveaxis(state, -1, 0)
+        return xp.stack([xp.cos(angle), xp.sin(angle), spin], axis=-1).astype(np.float32)
 
     def draw_frame(
         self, state: np.ndarray, action: np.ndarray, sim_params: Mapping[str, float]

@@ -5,7 +5,7 @@
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import mujoco.rollout
@@ -36,6 +36,16 @@ class ClassicVectorEnv(WorldVectorEnv):
         super().__init__(world, num_envs, autoreset_mode, episode_length)
         self._state = np.zeros((num_envs, world.state_size))
 
+    @property
+    def world(self) -> ClassicWorld:
+        """The laws that all environments follow."""
+        return self._world
+
+    @property
+    def states(self) -> np.ndarray:
+        """The physical states [env, state] as they are now."""
+        return self._state.copy()
+
     def _set_initial_state(self, i: int, rng: np.random.Generator) -> None:
         self._state[i] = self._world.initial_state(rng)
 
@@ -47,6 +57,18 @@ class ClassicVectorEnv(WorldVectorEnv):
 
     def _observe(self) -> np.ndarray:
         return self._world.observe(self._state)
+
+
+class Start(NamedTuple):
+    """Where a robot's future begins; nothing else is needed to repeat it to the bit."""
+
+    state: np.ndarray
+    """MuJoCo's full physical state."""
+    warm: np.ndarray
+    """The constraint solver's last result."""
+    velocity: float
+    """Average forward velocity over the control step that led here (m/s)."""
+    sim_params: SimParams
 
 
 class RolloutVectorEnv(WorldVectorEnv):
@@ -81,9 +103,20 @@ class RolloutVectorEnv(WorldVectorEnv):
         self._states = np.zeros((num_envs, 1, skip, size))
         self._sensors = np.zeros((num_envs, 1, skip, model.nsensordata))
         self._velocity = np.zeros(num_envs)
-        num_threads = min(_num_cpus(), num_envs)
+        num_threads = min(num_cpus(), num_envs)
         self._rollouts = [mujoco.rollout.Rollout(nthread=0) for _ in range(num_threads)]
         self._pool = ThreadPoolExecutor(num_threads - 1) if num_threads > 1 else None
+
+    @property
+    def world(self) -> Robot:
+        """The laws that all environments follow."""
+        return self._world
+
+    def start(self, i: int) -> Start:
+        """Where environment `i` is now."""
+        sim_params = {name: float(values[i]) for name, values in self._sim_params.items()}
+        velocity = float(self._velocity[i])
+        return Start(self._state[i, 0].copy(), self._warm[i, 0].copy(), velocity, sim_params)
 
     def _set_initial_state(self, i: int, rng: np.random.Generator) -> None:
         state, data = self._world.initial_state(rng), self._datas[i]
@@ -159,7 +192,7 @@ class RolloutVectorEnv(WorldVectorEnv):
             rollout.close()
 
 
-def _num_cpus() -> int:
+def num_cpus() -> int:
     """CPUs that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

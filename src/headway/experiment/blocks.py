@@ -23,6 +23,8 @@ from jaxtyping import Int, PRNGKeyArray
 
 from headway.config import Config, FittingConfig
 from headway.data import Episodes, Samples, Trajectory
+from headway.errors import DivergenceError
+from headway.experiment.methods import told_sim_params
 from headway.models.dynamics import Statistics
 from headway.models.fitting import EpochStats, FitData, FitSetup, FitState, fit_epoch, make_data
 
@@ -35,6 +37,8 @@ class Layout(NamedTuple):
 
     num_episodes: int
     episode_length: int
+    sim_param_names: tuple[str, ...] = ()
+    """The true simulator parameters that the model is told."""
 
     @classmethod
     def of(cls, config: Config, episode_length: int) -> "Layout":
@@ -45,11 +49,14 @@ class Layout(NamedTuple):
             episode_length: Most transitions of an episode; shorter ones are padded to it.
         """
         run = config.collection.num_iterations * config.collection.num_episodes
-        return cls(min(run, config.fitting.block_transitions // episode_length), episode_length)
+        num_episodes = min(run, config.fitting.block_transitions // episode_length)
+        return cls(num_episodes, episode_length, told_sim_params(config))
 
     def episodes(self, trajectories: list[Trajectory]) -> Episodes:
         """Lay out at most `num_episodes` trajectories."""
-        return Episodes.pad(trajectories, self.num_episodes, self.episode_length)
+        return Episodes.pad(
+            trajectories, self.num_episodes, self.episode_length, self.sim_param_names
+        )
 
     def samples(self, trajectories: list[Trajectory], fitting: FittingConfig) -> Samples:
         """List the samples of at most `num_episodes` trajectories."""
@@ -187,6 +194,19 @@ def merge_stats(parts: Sequence[EpochStats]) -> EpochStats:
     total = max(taken.sum(), 1.0)
     averages = (taken * loss).sum() / total, (taken * forward_loss).sum() / total
     return EpochStats(*averages, skipped.sum(), updates.sum())
+
+
+def check_epoch(stats: EpochStats, iteration: int, epoch: int) -> None:
+    """Stop a fit that has lost all finite numbers.
+
+    Raises:
+        DivergenceError: No update of the epoch was taken.
+    """
+    if stats.skipped == stats.updates:
+        raise DivergenceError(
+            f"no update of epoch {epoch} of iteration {iteration} had a finite loss and gradient;"
+            " try a smaller fitting.learning_rate."
+        )
 
 
 def made_ahead(make: Callable[[Item], Made], items: Iterable[Item]) -> Generator[Made, None, None]:

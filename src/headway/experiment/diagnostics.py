@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from headway.data import Episodes, Trajectory
+from headway.data import Episodes, Trajectory, sim_params_row
 from headway.experiment.tables import format_sim_params
 from headway.models.fitting import FitSetup, assign_segments
 from headway.planning.agent import Agent, choose_heads, encode, planning_heads
 from headway.planning.heads import RecentTransitions
 from headway.planning.imagination import ImaginedDynamics
-from headway.planning.returns import imagine_step
 
 NUM_STARTS = 256  # imagined rollouts per group in `prediction_error`
 
@@ -78,7 +77,10 @@ def prediction_error(
         jnp.full(len(starts), slots, jnp.int32),
     )
     truth = cut(0, horizon, 1, "obs")
-    imagined = _imagine(agent, recent, cut(0, horizon, 0, "action"), key)
+    physics, names = None, agent.model.sim_param_names
+    if names:
+        physics = jnp.asarray(np.stack([sim_params_row(t.sim_params, names) for t, _ in starts]))
+    imagined = _imagine(agent, recent, physics, cut(0, horizon, 0, "action"), key)
     scaled = (np.asarray(imagined) - np.asarray(truth)) / np.where(std > 1e-6, std, np.inf)
     return np.sqrt(np.square(scaled).mean((0, 1, 3)))
 
@@ -87,12 +89,13 @@ def prediction_error(
 def _imagine(
     agent: Agent,
     recent: RecentTransitions,
+    sim_params: Float[Array, "env sim_param"] | None,
     actions: Float[Array, "env horizon action"],
     key: PRNGKeyArray,
 ) -> Float[Array, "member env horizon obs"]:
     """Mean prediction of every member along given actions, from many moments at once."""
     head_key, error_key = jax.random.split(key)
-    context = encode(agent, recent)
+    context = encode(agent, recent, sim_params)
     heads = choose_heads(agent, recent, context, error_key=error_key, head_key=head_key)
     folded = planning_heads(agent, heads)
     dynamics = ImaginedDynamics.fold(agent.model, agent.statistics, folded, context)
@@ -103,7 +106,7 @@ def _imagine(
 
         def step(obs, action):
             wide = jnp.broadcast_to(action[:, None, None], (members, action.size, 1, 1))
-            obs = imagine_step(one, agent.task, obs, wide, None)
+            _, obs = one.step(agent.task, (), obs, wide, None)
             return obs, obs[..., 0, 0]
 
         start = jnp.broadcast_to(now[:, None, None], (members, now.size, 1, 1))

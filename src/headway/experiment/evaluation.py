@@ -13,7 +13,7 @@ from headway.experiment.progress_store import ProgressStore
 from headway.experiment.resumable import resumable_episodes
 from headway.experiment.rollouts import AgentPolicy, Arena, Episode, PlannerUse, run_episodes
 from headway.experiment.tables import EpisodeRow
-from headway.planning.agent import Agent
+from headway.planning.acting import Acting
 from headway.planning.flop import plan_flop
 from headway.sim_params import SimParamSets
 from headway.tasks.base import Task
@@ -66,7 +66,7 @@ def group_episodes(
 
 
 def evaluate_agent(
-    agent: Agent,
+    agent: Acting,
     arena: Arena,
     config: Config,
     groups: Sequence[str],
@@ -103,8 +103,8 @@ def evaluate_agent(
     for chunk, start in enumerate(range(0, len(episodes), size)):
         batch = episodes[start : start + size]
         chunk_key = jax.random.fold_in(key, chunk)
-        policy = functools.partial(AgentPolicy, agent, size, key=chunk_key)
         side_by_side = [episode for _, episode in batch]
+        policy = functools.partial(AgentPolicy, agent, size, side_by_side, key=chunk_key)
         if store is None:
             rollout = run_episodes(arena, side_by_side, policy(), on_step)
         else:

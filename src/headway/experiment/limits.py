@@ -9,6 +9,8 @@ import jax
 from headway.config import Config
 from headway.errors import LimitError
 from headway.experiment.blocks import Layout
+from headway.experiment.methods import told_sim_params
+from headway.models.dynamics import context_layer, context_size
 from headway.tasks.base import Task
 
 PROCESS = 650 * 2**20  # Python, JAX, a simulator and compiled code, measured
@@ -84,13 +86,20 @@ def num_parameters(config: Config, task: Task) -> int:
     model = config.model
     features = 2 * task.obs_size + task.action_size
     hidden = _dense((features, *model.hidden_sizes))
-    outputs = (model.hidden_sizes[-1] + model.context_size + 1) * task.obs_size
+    context, place = _context_size(config, task), context_layer(model)
+    outputs = (model.hidden_sizes[-1] + 1 + (context if place is None else 0)) * task.obs_size
+    if place is not None:
+        hidden += context * model.hidden_sizes[place]
     heads = model.num_heads * outputs * (1 if model.deterministic else 2)
     nets = (2 if model.backward_net else 1) * (hidden + heads)
-    if model.context_size:
+    if model.context == "learned" and context:
         history = model.history_length * (task.obs_size + task.action_size)
-        nets += _dense((history, *model.context_hidden_sizes, model.context_size))
+        nets += _dense((history, *model.context_hidden_sizes, context))
     return model.num_members * nets
+
+
+def _context_size(config: Config, task: Task) -> int:
+    return context_size(config.model, task, len(told_sim_params(config)))
 
 
 def _dense(sizes: tuple[int, ...]) -> int:
@@ -103,7 +112,17 @@ def _batch(config: Config, task: Task) -> int:
     heads = 2 * model.num_heads * (model.hidden_sizes[-1] + 3 * task.obs_size)
     widths = 3 * (sum(model.hidden_sizes) + sum(model.context_hidden_sizes)) + heads
     nets = 2 if model.backward_net else 1
-    return FLOAT * nets * model.num_members * config.fitting.batch_size * widths
+    of_batch = nets * model.num_members * config.fitting.batch_size * widths
+    return FLOAT * (of_batch + _relation(config, task))
+
+
+def _relation(config: Config, task: Task) -> int:
+    """Numbers about all pairs of a batch's contexts, for the gradient of one state."""
+    samples, states = config.fitting.batch_size, config.fitting.relation_transitions
+    if not config.model.relation_head:
+        return 0
+    pairs = samples**2 * (2 * task.obs_size + min(states or samples, samples) + 10)
+    return config.model.num_members * pairs
 
 
 def _assignment(config: Config, task: Task, episode_length: int) -> int:

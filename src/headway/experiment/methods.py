@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from headway.config import Config
+from headway.config import PLAIN, Config
 from headway.errors import ConfigError, unknown_name
 from headway.settings import override, setting_names
 from headway.tasks.catalog import EnvSpec, env_spec
@@ -36,6 +36,29 @@ class Preset:
 
 _NO_CONTEXT: Settings = {"model.context_size": 0, "model.backward_net": False}
 
+_PLAIN: Settings = {
+    **{f"model.{name}": value for name, value in PLAIN.items()},
+    "fitting.oracle": "independent",
+    "fitting.future_length": 1,
+    "planner.num_particles": 1,
+}
+"""One network without heads, context or noise."""
+
+_ONLY_A_TEST: Settings = {"collection.num_iterations": 1}
+_ONE_HEAD: Settings = {"model.num_heads": 1, "fitting.oracle": "independent"}
+_VANILLA: Settings = {
+    **_ONE_HEAD,
+    "model.num_members": 1,
+    "model.deterministic": True,
+    "planner.num_particles": 1,
+}
+_CADM: Settings = {
+    "model.context_at": "input",
+    "model.backward_deterministic": True,
+    "fitting.future_length": 10,
+    "fitting.context_weight_decay": True,
+}
+
 _METHODS = (
     Method("tmcl", "trajectory-wise multiple choice learning (the paper's method)", {}),
     Method(
@@ -48,8 +71,7 @@ _METHODS = (
         "ensemble of single-headed probabilistic networks, no context (Chua et al., 2018)",
         {
             **_NO_CONTEXT,
-            "model.num_heads": 1,
-            "fitting.oracle": "independent",
+            **_ONE_HEAD,
             "fitting.future_length": 1,
         },
     ),
@@ -68,13 +90,62 @@ _METHODS = (
         "one deterministic network",
         {
             **_NO_CONTEXT,
-            "model.num_members": 1,
-            "model.num_heads": 1,
-            "model.deterministic": True,
-            "fitting.oracle": "independent",
+            **_VANILLA,
             "fitting.future_length": 1,
-            "planner.num_particles": 1,
         },
+    ),
+    Method(
+        "stacked",
+        "vanilla with the flattened history appended to the input",
+        {
+            **_VANILLA,
+            "model.context": "history",
+            "model.context_at": "input",
+            "model.backward_net": False,
+            "fitting.future_length": 1,
+        },
+    ),
+    Method(
+        "cadm",
+        "vanilla with a learned context at the input (Lee et al., 2020)",
+        {**_VANILLA, **_CADM},
+    ),
+    Method(
+        "pets-cadm",
+        "PETS with CaDM's learned context at the input (Lee et al., 2020)",
+        {**_ONE_HEAD, **_CADM},
+    ),
+    Method(
+        "oracle-params",
+        "PETS that is told the true simulator parameters, an upper line; not a fair method",
+        {
+            **_ONE_HEAD,
+            "model.context": "sim-params",
+            "model.context_at": "input",
+            "model.backward_net": False,
+            "fitting.future_length": 1,
+        },
+    ),
+    Method(
+        "ria",
+        "one head, context shaped by relational intervention (Guo et al., 2022)",
+        {
+            **_ONE_HEAD,
+            "model.context_at": "last-hidden",
+            "model.relation_head": True,
+            "fitting.batch_size": 200,
+            "fitting.context_weight_decay": False,  # the relation loss decays it
+        },
+    ),
+    Method(
+        "random",
+        "uniform random actions; nothing is learned",
+        {**_PLAIN, **_ONLY_A_TEST, "model.kind": "none"},
+    ),
+    Method(
+        "true-dynamics",
+        "the same planner on the real simulator: the environment's ceiling",
+        {**_PLAIN, **_ONLY_A_TEST, "model.kind": "simulator"},
     ),
 )
 
@@ -207,6 +278,13 @@ def config_to_evaluate(config: Config, settings: Settings) -> Config:
                 f" {' and '.join(EVALUATED_SECTIONS)}; train another run to change it."
             )
     return override(config, settings)
+
+
+def told_sim_params(config: Config) -> tuple[str, ...]:
+    """The simulator parameters that the model is told, by name; none but with `sim-params`."""
+    if config.model.context != "sim-params":
+        return ()
+    return (config.sim_params or env_spec(config.env).sim_params).names
 
 
 def check_options(config: Config) -> None:

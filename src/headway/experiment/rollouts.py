@@ -18,7 +18,7 @@ from headway import envs
 from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import BadEnvironmentError
-from headway.planning.agent import Agent
+from headway.planning.acting import Acting
 from headway.planning.controller import env_action
 from headway.sim_params import SimParamSets
 from headway.tasks.base import Task
@@ -102,11 +102,22 @@ def random_policy(arena: Arena, rng: np.random.Generator) -> Policy:
 
 
 class AgentPolicy:
-    """An agent and what it remembers of each environment; it starts with an empty memory."""
+    """An agent and what it remembers of each environment; it starts with an empty memory.
 
-    def __init__(self, agent: Agent, num_envs: int, *, key: PRNGKeyArray):
+    Args:
+        agent: The agent.
+        num_envs: Environments of the batch.
+        episodes: What they run, for an agent that is told the physics; surplus environments
+            repeat the last episode.
+        key: The planner's draws.
+    """
+
+    def __init__(
+        self, agent: Acting, num_envs: int, episodes: Sequence[Episode], *, key: PRNGKeyArray
+    ):
         self._agent = agent
-        self.state = agent.init(num_envs, key=key)
+        physics = [episode.sim_params for episode in fill(episodes, num_envs)]
+        self.state = agent.init(num_envs, key=key, sim_params=physics)
 
     def __call__(self, obs: Float[np.ndarray, "env obs"]) -> Choice:
         """See `Policy`."""
@@ -166,7 +177,7 @@ def run_episodes(
         BadEnvironmentError: An environment returned non-finite or misshapen values.
     """
     wanted = len(episodes)
-    filled = [*episodes, *[episodes[-1]] * (arena.vector.num_envs - wanted)]
+    filled = fill(episodes, arena.vector.num_envs)
     names = filled[0].sim_params
     sim_params = {name: np.array([e.sim_params[name] for e in filled]) for name in names}
     seeds: Any = [episode.seed for episode in filled]
@@ -199,6 +210,11 @@ def run_episodes(
         for row in range(wanted)
     ]
     return Rollout(trajectories, use)
+
+
+def fill(episodes: Sequence[Episode], num_envs: int) -> list[Episode]:
+    """Give every environment of a batch an episode; surplus ones repeat the last."""
+    return [*episodes, *[episodes[-1]] * (num_envs - len(episodes))]
 
 
 def check(

@@ -5,7 +5,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from headway.errors import RunError
+from headway.errors import BusyError
 
 try:
     import fcntl
@@ -23,7 +23,7 @@ def locked(path: Path) -> Iterator[None]:
     promised for local disks; network file systems may not tell other machines of it.
 
     Raises:
-        RunError: Another process holds the directory.
+        BusyError: Another process holds the directory.
     """
     if fcntl is None:  # pragma: no cover
         yield
@@ -34,7 +34,7 @@ def locked(path: Path) -> Iterator[None]:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(handle)
-        raise RunError(
+        raise BusyError(
             f"{path} is being trained by another process, allowed: one at a time; wait for it or"
             " choose another --run-dir."
         ) from None

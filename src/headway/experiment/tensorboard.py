@@ -18,7 +18,7 @@ def write_tensorboard(run_dir: Path, metrics: dict[str, Any]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         with SummaryWriter(folder) as writer:
             for section in ("collection", "fitting", "evaluation", "seconds"):
-                for name, value in metrics[section].items():
+                for name, value in metrics.get(section, {}).items():
                     number = value["return_mean"] if isinstance(value, dict) else value
                     if isinstance(number, int | float):
                         writer.add_scalar(f"{section}/{name}", number, metrics["timesteps"])

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import itertools
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,12 +13,11 @@ from jaxtyping import PRNGKeyArray
 
 from headway.config import Config
 from headway.data import ReplayBuffer, Trajectory
-from headway.errors import DivergenceError, RunError
+from headway.errors import RunError
 from headway.experiment import arrays
-from headway.experiment.blocks import BlockedData, Layout, fit_blocks
-from headway.experiment.diagnostics import head_shares, prediction_error
 from headway.experiment.evaluation import episode_rows, evaluate_agent
 from headway.experiment.interrupts import StopRequest, stop_requests
+from headway.experiment.learners import Learned, Learner, make_learner
 from headway.experiment.limits import MemoryNeed, check_memory, memory_need
 from headway.experiment.methods import check_block, check_options
 from headway.experiment.progress import Progress
@@ -41,18 +39,9 @@ from headway.experiment.rollouts import (
 )
 from headway.experiment.runs import RunDir
 from headway.experiment.tensorboard import write_tensorboard
-from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.models.fitting import EpochStats, FitSetup, FitState
-from headway.planning.agent import Agent
+from headway.planning.acting import Acting
 from headway.tasks.base import Task
 from headway.tasks.catalog import env_spec
-
-
-class Learned(NamedTuple):
-    """What a checkpoint holds."""
-
-    fit: FitState
-    statistics: Statistics
 
 
 class Keys(NamedTuple):
@@ -76,8 +65,7 @@ class Trainer:
     config: Config
     run: RunDir
     arena: Arena
-    layout: Layout
-    setup: FitSetup
+    learner: Learner
     learned: Learned
     buffer: ReplayBuffer
     progress: Progress
@@ -94,22 +82,21 @@ class Trainer:
             BadEnvironmentError: The environment does not fit its Task.
         """
         arena = Arena.make(config)
-        layout = Layout.of(config, arena.episode_length)
+        learner = make_learner(config, arena.task, arena.episode_length)
         run.create_or_resume(config)
         run.check()
         run.tidy()
-        setup = FitSetup(arena.task, config.fitting, config.model.history_length)
         buffer = ReplayBuffer(arena.task.obs_size, arena.task.action_size)
         for trajectory in run.load_data():
             buffer.add(trajectory)
         finished = run.finished_iterations
         learned = initial(config, arena.task) if finished == 0 else load_learned(run, config)
-        return cls(config, run, arena, layout, setup, learned, buffer, progress, stop)
+        return cls(config, run, arena, learner, learned, buffer, progress, stop)
 
     @property
-    def agent(self) -> Agent:
+    def agent(self) -> Acting:
         """The agent as learned so far."""
-        return make_agent(self.config, self.arena.task, self.learned)
+        return self.learner.agent(self.learned, self.arena, self.buffer.trajectories)
 
     def phase(self, iteration: int, name: str) -> None:
         """Announce what comes next."""
@@ -120,11 +107,11 @@ class Trainer:
         """Environment steps or epochs of each phase of an iteration."""
         length, config = self.arena.episode_length, self.config
         num_tests = len(self.groups(iteration)) * config.evaluation.num_episodes
-        return {
+        learning = {
             "collect": config.collection.num_episodes * length,
             "fit": config.fitting.epochs,
-            "evaluate": num_tests * length,
         }
+        return {**(learning if self.learner.learns else {}), "evaluate": num_tests * length}
 
     def groups(self, iteration: int) -> list[str]:
         """The groups that are tested after an iteration; often none."""
@@ -141,23 +128,28 @@ class Trainer:
         self.store = self.run.partial(self.stop)
         take_up(self.store, self.progress)
         keys = Keys.of(self.config.seed, iteration)
-        with self.store.timing("collect"):
-            collected, failures = self.collect(iteration, keys.collect)
-        with self.store.timing("fit"):
-            fitting = self.fit(iteration, keys.fit)
+        learning = self.learn(iteration, keys) if self.learner.learns else {}
         with self.store.timing("evaluate"):
             tested, test_use = self.evaluate(iteration, keys.evaluate)
         metrics = {
             "iteration": iteration,
             "timesteps": self.buffer.num_transitions,
-            "collection": {**_summary(collected), "planner_failures": failures},
-            "fitting": fitting,
+            **learning,
             "evaluation": {group: _summary(found) for group, found in tested.items()},
             "test_planner_failures": test_use.failures,
             "seconds": self.store.seconds,
         }
         self.save(iteration, tested, metrics, keys.diagnose)
         self.progress.iteration_done(metrics)
+
+    def learn(self, iteration: int, keys: Keys) -> dict[str, Any]:
+        """Collect and fit; return what is measured of both."""
+        with self.store.timing("collect"):
+            collected, failures = self.collect(iteration, keys.collect)
+        with self.store.timing("fit"):
+            fitting = self.fit(iteration, keys.fit)
+        collection = {**_summary(collected), "planner_failures": failures}
+        return {"collection": collection, "fitting": fitting}
 
     def collect(self, iteration: int, key: PRNGKeyArray) -> tuple[list[Trajectory], int]:
         """Run one episode in each environment, under physics drawn from the training set."""
@@ -170,7 +162,7 @@ class Trainer:
         def policy() -> Policy:
             if iteration == 0:
                 return random_policy(arena, rng)
-            return AgentPolicy(self.agent, num_episodes, key=key)
+            return AgentPolicy(self.agent, num_episodes, episodes, key=key)
 
         self.phase(iteration, "collect")
         advance = self.progress.advance
@@ -191,27 +183,19 @@ class Trainer:
         Raises:
             DivergenceError: No update of an epoch had finite numbers.
         """
-        fitting = self.config.fitting
-        data_key, epoch_key = jax.random.split(key)
-        data = self.fit_data(data_key)
-        independent = (
-            iteration < fitting.warmup_iterations
-            or fitting.oracle == "independent"
-            or self.config.model.num_heads == 1
-        )
+        fit = self.learner.fit(self.buffer.trajectories, iteration, key)
         self.phase(iteration, "fit")
         state, history = fitted_before(self.store, self.learned.fit)
         self.progress.advance(len(history))
         done = len(history)
-        with closing(data.stream(fitting.epochs, epoch_key, first=done)) as blocks:
-            for epoch in range(done, fitting.epochs):
-                of_epoch = itertools.islice(blocks, data.num_blocks)
-                state, stats = fit_blocks(state, self.setup, of_epoch, independent=independent)
+        with closing(fit.epochs(state, done)) as epochs:
+            for epoch, (fitted, stats) in enumerate(epochs, done):
+                state = fitted
                 check_epoch(stats, iteration, epoch)
                 self.progress.advance(1, loss=float(stats.loss))
                 history.append(stats)
                 self.store.offer("fit", functools.partial(fit_part, state, list(history)))
-        self.learned = Learned(state, data.statistics)
+        self.learned = Learned(state, fit.statistics)
         return {
             "loss": float(history[-1].loss),
             "forward_loss": float(history[-1].forward_loss),
@@ -219,14 +203,6 @@ class Trainer:
             "skipped_updates": sum(int(stats.skipped) for stats in history),
             "transitions": self.buffer.num_transitions,
         }
-
-    def fit_data(self, key: PRNGKeyArray) -> BlockedData:
-        """Everything collected, with renewed statistics, ready to be fitted."""
-        model, trajectories = self.config.model, self.buffer.trajectories
-        statistics = Statistics.fit(self.arena.task, trajectories, model.history_length)
-        return BlockedData(
-            trajectories, self.layout, statistics, self.setup, model.num_members, key
-        )
 
     def evaluate(
         self, iteration: int, key: PRNGKeyArray
@@ -254,16 +230,15 @@ class Trainer:
         key: PRNGKeyArray,
     ) -> None:
         """Write everything of a finished iteration; the metrics come last."""
-        run, config = self.run, self.config
+        run, config, learner = self.run, self.config, self.learner
         arrays.save_tree(run.checkpoint(iteration), self.learned)
         run.append_evaluation(episode_rows(config, iteration, tested))
-        blocks = self.layout.in_order(self.buffer.trajectories)
-        shares = head_shares(self.agent, self.setup, blocks)
+        shares = learner.head_shares(self.learned, self.buffer.trajectories)
         run.append_assignments([{"iteration": iteration, **row} for row in shares])
         errors = [
             {"iteration": iteration, "group": group, "step": step + 1, "error": float(error)}
             for group, found in tested.items()
-            for step, error in enumerate(prediction_error(self.agent, found, key=key))
+            for step, error in enumerate(learner.prediction_error(self.learned, found, key))
         ]
         run.append_prediction_errors(errors)
         run.append_metrics([metrics])
@@ -320,32 +295,16 @@ def need_of(config: Config) -> MemoryNeed:
     return memory_need(config, load_task(config), length)
 
 
-def check_epoch(stats: EpochStats, iteration: int, epoch: int) -> None:
-    """Stop a fit that has lost all finite numbers.
-
-    Raises:
-        DivergenceError: No update of the epoch was taken.
-    """
-    if stats.skipped == stats.updates:
-        raise DivergenceError(
-            f"no update of epoch {epoch} of iteration {iteration} had a finite loss and gradient;"
-            " try a smaller fitting.learning_rate."
-        )
-
-
-def make_agent(config: Config, task: Task, learned: Learned) -> Agent:
-    """Join what was learned with the planner's settings."""
-    return Agent(
-        learned.fit.model, learned.statistics, task, config.planner, config.model.history_length
-    )
-
-
 def initial(config: Config, task: Task) -> Learned:
-    """The untrained networks of a seed."""
-    setup = FitSetup(task, config.fitting, config.model.history_length)
+    """What a seed begins with, untrained."""
     key = jax.random.fold_in(jax.random.key(config.seed), 0)
-    model = MultiHeadDynamics.init(config.model, task, key=key)
-    return Learned(setup.init(model), Statistics.identity(task, config.model.history_length))
+    return learner_of(config, task).initial(key)
+
+
+def learner_of(config: Config, task: Task) -> Learner:
+    """The learner of a configuration."""
+    length = config.collection.episode_length or env_spec(config.env).episode_length
+    return make_learner(config, task, length)
 
 
 def load_learned(run: RunDir, config: Config) -> Learned:
@@ -366,18 +325,22 @@ def load_learned(run: RunDir, config: Config) -> Learned:
     return arrays.load_tree(run.checked_checkpoint(finished - 1), template)
 
 
-def load_agent(run: RunDir, config: Config | None = None) -> Agent:
+def load_agent(run: RunDir, config: Config | None = None, arena: Arena | None = None) -> Acting:
     """The agent of a run, as trained so far.
 
     Args:
         run: The run.
         config: Its settings, with those of the planner perhaps changed; as it is by default.
+        arena: Where it will act; a run on the true dynamics cannot do without.
 
     Raises:
         RunError: There is no run, it has no finished iteration, or it is damaged.
+        ConfigError: It is a run on the true dynamics, and there is no arena.
     """
     config = config or run.config()
-    return make_agent(config, load_task(config), load_learned(run, config))
+    learned = load_learned(run, config)
+    trajectories = run.load_data() if config.planner.adaptation != "none" else []
+    return learner_of(config, load_task(config)).agent(learned, arena, trajectories)
 
 
 def load_task(config: Config) -> Task:

@@ -8,8 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from headway.config import ModelConfig
-from headway.data import History, Trajectory, history_action_moments, parts_of
+from headway.config import ContextKind, ModelConfig
+from headway.data import (
+    History,
+    Trajectory,
+    history_action_moments,
+    parts_of,
+    sim_params_row,
+)
 from headway.models.moments import Moments, merge_columns
 from headway.models.networks import Dense, DenseHeads, Normalizer, bound_logvar, swish
 from headway.tasks.base import Task
@@ -24,41 +30,52 @@ class Prediction(NamedTuple):
     logvar: Float[Array, "*batch obs"] | None
 
 
+class NetSizes(NamedTuple):
+    """Widths of what enters and leaves a network."""
+
+    input: int
+    context: int
+    output: int
+
+
 class GaussianNet(eqx.Module):
-    """Backbone and prediction heads of every member; the context joins after the backbone."""
+    """Backbone and prediction heads of every member; the context joins on the way."""
 
     hidden: tuple[Dense, ...]
     mean_heads: DenseHeads
     logvar_heads: DenseHeads | None
     max_logvar: Float[Array, "head obs"] | None
     min_logvar: Float[Array, "head obs"] | None
+    context_layer: int | None = eqx.field(static=True, default=None)
+    """The hidden layer that takes the context beside its input; None if the heads do."""
 
     @classmethod
     def init(
-        cls, config: ModelConfig, in_size: int, out_size: int, *, key: PRNGKeyArray
+        cls,
+        config: ModelConfig,
+        sizes: NetSizes,
+        *,
+        deterministic: bool,
+        key: PRNGKeyArray,
     ) -> "GaussianNet":
         """Draw the weights of one network per member."""
         members, heads = config.num_members, config.num_heads
+        place = context_layer(config)
         *hidden_keys, mean_key, logvar_key = jax.random.split(key, len(config.hidden_sizes) + 2)
-        sizes = (in_size, *config.hidden_sizes)
+        widths = [sizes.input, *config.hidden_sizes]
+        outs = widths[1:]
+        widths[-1 if place is None else place] += sizes.context
+        *ins, head_size = widths
         hidden = tuple(
-            Dense.init(members, n, m, key=k)
-            for n, m, k in zip(sizes[:-1], sizes[1:], hidden_keys, strict=True)
+            Dense.init(members, n, m, key=k) for n, m, k in zip(ins, outs, hidden_keys, strict=True)
         )
-        head_size = sizes[-1] + config.context_size
-        mean_heads = DenseHeads.init(members, heads, head_size, out_size, key=mean_key)
-        if config.deterministic:
-            return cls(hidden, mean_heads, None, None, None)
-        logvar_heads = DenseHeads.init(members, heads, head_size, out_size, key=logvar_key)
-        shape = (heads, out_size)
+        mean_heads = DenseHeads.init(members, heads, head_size, sizes.output, key=mean_key)
+        if deterministic:
+            return cls(hidden, mean_heads, None, None, None, place)
+        logvar_heads = DenseHeads.init(members, heads, head_size, sizes.output, key=logvar_key)
+        shape = (heads, sizes.output)
         bounds = jnp.full(shape, 0.5, jnp.float32), jnp.full(shape, -10.0, jnp.float32)
-        return cls(hidden, mean_heads, logvar_heads, *bounds)
-
-    def backbone(self, x: Float[Array, "member batch in"]) -> Float[Array, "member batch hidden"]:
-        """Run the shared hidden layers."""
-        for layer in self.hidden:
-            x = swish(layer(x))
-        return x
+        return cls(hidden, mean_heads, logvar_heads, *bounds, place)
 
     def __call__(
         self,
@@ -66,13 +83,49 @@ class GaussianNet(eqx.Module):
         context: Float[Array, "member batch context"] | None,
     ) -> Prediction:
         """Predict with every head; results are [member, head, batch, obs]."""
-        x = self.backbone(x)
-        if context is not None:
-            x = jnp.concatenate([x, context], axis=-1)
+        return self.predict(self.head_input(x, context))
+
+    def head_input(
+        self,
+        x: Float[Array, "member batch in"],
+        context: Float[Array, "member batch context"] | None,
+    ) -> Float[Array, "member batch hidden"]:
+        """Run the shared hidden layers; where the context joins the heads, it is appended."""
+        for index, layer in enumerate(self.hidden):
+            x = swish(layer(_joined(x, context) if index == self.context_layer else x))
+        return _joined(x, context) if self.context_layer is None else x
+
+    def predict(self, x: Float[Array, "member batch hidden"]) -> Prediction:
+        """Run the heads; results are [member, head, batch, obs]."""
         if self.logvar_heads is None:
             return Prediction(self.mean_heads(x), None)
         low, high = self.min_logvar[:, None, :], self.max_logvar[:, None, :]
         return Prediction(self.mean_heads(x), bound_logvar(self.logvar_heads(x), low, high))
+
+
+def context_layer(config: ModelConfig) -> int | None:
+    """Which hidden layer takes the context beside its input; None if the heads do."""
+    last = len(config.hidden_sizes) - 1
+    return {"input": 0, "last-hidden": last, "head": None}[config.context_at]
+
+
+def context_size(config: ModelConfig, task: Task, num_sim_params: int) -> int:
+    """Width of the context; 0 where the networks see none.
+
+    Args:
+        config: Settings of the model.
+        task: The sizes of observations and actions.
+        num_sim_params: Simulator parameters that a model with `sim-params` as context is told.
+    """
+    history = config.history_length * (task.obs_size + task.action_size)
+    of_kind = {"learned": config.context_size, "history": history, "sim-params": num_sim_params}
+    return of_kind[config.context]
+
+
+def _joined(
+    x: Float[Array, "member batch in"], context: Float[Array, "member batch context"] | None
+) -> Float[Array, "member batch wider"]:
+    return x if context is None else jnp.concatenate([x, context], axis=-1)
 
 
 class ContextEncoder(eqx.Module):
@@ -107,9 +160,13 @@ class Statistics(eqx.Module):
     delta: Normalizer
     backward_delta: Normalizer
     history_action: Normalizer
+    sim_params: Normalizer | None = None
+    """Only for a model that takes the true simulator parameters."""
 
     @classmethod
-    def identity(cls, task: Task, history_length: int) -> "Statistics":
+    def identity(
+        cls, task: Task, history_length: int, sim_param_names: tuple[str, ...] = ()
+    ) -> "Statistics":
         """Statistics before any data: nothing is scaled."""
         return cls(
             Normalizer.identity(task.feature_size),
@@ -117,19 +174,43 @@ class Statistics(eqx.Module):
             Normalizer.identity(task.obs_size),
             Normalizer.identity(task.obs_size),
             Normalizer.identity(history_length, task.action_size),
+            Normalizer.identity(len(sim_param_names)) if sim_param_names else None,
         )
 
     @classmethod
-    def fit(cls, task: Task, trajectories: list[Trajectory], history_length: int) -> "Statistics":
+    def fit(
+        cls,
+        task: Task,
+        trajectories: list[Trajectory],
+        history_length: int,
+        sim_param_names: tuple[str, ...] = (),
+    ) -> "Statistics":
         """Recompute from all data so far, as at the start of every iteration (B.3).
 
         The data are read once, in parts of `PART_TRANSITIONS`, and never held together.
+
+        Args:
+            task: How observations enter and leave the model.
+            trajectories: All data.
+            history_length: Past transitions that a context is made of (K).
+            sim_param_names: Simulator parameters that the model is told.
         """
         parts = parts_of(trajectories, PART_TRANSITIONS)
         found = merge_columns(transition_moments(task, part) for part in parts)
         features, action, delta, backward = (Normalizer.of_moments(m.mean, m.std) for m in found)
-        history = history_action_moments(trajectories, history_length)
-        return cls(features, action, delta, backward, Normalizer.of_moments(*history))
+        history = Normalizer.of_moments(*history_action_moments(trajectories, history_length))
+        physics = fit_sim_params(trajectories, sim_param_names) if sim_param_names else None
+        return cls(features, action, delta, backward, history, physics)
+
+
+def fit_sim_params(trajectories: list[Trajectory], names: tuple[str, ...]) -> Normalizer:
+    """Mean and standard deviation of simulator parameters over all transitions.
+
+    A parameter that never varied is shifted to 0 and not scaled.
+    """
+    rows = np.stack([sim_params_row(t.sim_params, names) for t in trajectories])
+    moments = Moments.of(np.repeat(rows, [len(t) for t in trajectories], axis=0))
+    return Normalizer.of_moments(moments.mean, moments.std)
 
 
 def transition_moments(
@@ -147,27 +228,53 @@ def transition_moments(
 
 
 class MultiHeadDynamics(eqx.Module):
-    """An ensemble of multi-headed networks, with optional context encoder and backward net."""
+    """An ensemble of multi-headed networks, with optional context and backward net."""
 
     forward_net: GaussianNet
     backward_net: GaussianNet | None
     context_encoder: ContextEncoder | None
+    relation_head: Dense | None = None
+    """Tells from two contexts, one after the other, whether they are of one trajectory."""
+    context_kind: ContextKind = eqx.field(static=True, default="learned")
+    sim_param_names: tuple[str, ...] = eqx.field(static=True, default=())
+    """The true simulator parameters that are its context, in their order; mostly none."""
 
     @classmethod
-    def init(cls, config: ModelConfig, task: Task, *, key: PRNGKeyArray) -> "MultiHeadDynamics":
-        """Draw initial weights for a task's sizes."""
+    def init(
+        cls,
+        config: ModelConfig,
+        task: Task,
+        *,
+        sim_param_names: tuple[str, ...] = (),
+        key: PRNGKeyArray,
+    ) -> "MultiHeadDynamics":
+        """Draw initial weights for a task's sizes.
+
+        Args:
+            config: Settings of the model.
+            task: The sizes of observations and actions.
+            sim_param_names: The simulator parameters that a model with `sim-params` as context
+                is told.
+            key: Draws the weights.
+        """
         forward_key, backward_key, context_key = jax.random.split(key, 3)
-        in_size = task.feature_size + task.action_size
-        history_size = config.history_length * (task.obs_size + task.action_size)
-        return cls(
-            GaussianNet.init(config, in_size, task.obs_size, key=forward_key),
-            GaussianNet.init(config, in_size, task.obs_size, key=backward_key)
-            if config.backward_net
-            else None,
-            ContextEncoder.init(config, history_size, key=context_key)
-            if config.context_size
-            else None,
-        )
+        width = context_size(config, task, len(sim_param_names))
+        sizes = NetSizes(task.feature_size + task.action_size, width, task.obs_size)
+        deterministic = config.deterministic
+        forward = GaussianNet.init(config, sizes, deterministic=deterministic, key=forward_key)
+        backward = encoder = relation = None
+        if config.backward_net:
+            deterministic = config.deterministic or config.backward_deterministic
+            backward = GaussianNet.init(
+                config, sizes, deterministic=deterministic, key=backward_key
+            )
+        if config.context == "learned" and width:
+            history_size = config.history_length * (task.obs_size + task.action_size)
+            encoder = ContextEncoder.init(config, history_size, key=context_key)
+        if config.relation_head:
+            relation_key = jax.random.fold_in(key, 3)
+            relation = Dense.init(config.num_members, 2 * width, 1, key=relation_key)
+        return cls(forward, backward, encoder, relation, config.context, sim_param_names)
 
     @property
     def num_members(self) -> int:
@@ -180,20 +287,37 @@ class MultiHeadDynamics(eqx.Module):
         return self.forward_net.mean_heads.weight.shape[1]
 
     def context(
-        self, history: History, statistics: Statistics
+        self,
+        history: History,
+        statistics: Statistics,
+        sim_params: Float[Array, "member batch sim_param"] | None = None,
     ) -> Float[Array, "member batch context"] | None:
-        """Encode histories; state differences are not normalised (fact sheet B.3).
+        """What the networks are told of the hidden physics; None where it is nothing.
 
         Args:
             history: Past transitions, [member, batch, K, ...].
             statistics: The normalisers in use.
+            sim_params: The true simulator parameters, for a model that is told them.
         """
+        if self.context_kind == "sim-params":
+            assert statistics.sim_params is not None
+            assert sim_params is not None
+            return statistics.sim_params.normalize(sim_params)
+        if self.context_kind == "history":
+            return flat_history(history, statistics)
         if self.context_encoder is None:
             return None
-        members, batch = history.action.shape[:2]
-        action = statistics.history_action.normalize(history.action)
-        flat = [history.obs_diff.reshape(members, batch, -1), action.reshape(members, batch, -1)]
-        return self.context_encoder(jnp.concatenate(flat, axis=-1))
+        return self.context_encoder(flat_history(history, statistics))
+
+
+def flat_history(
+    history: History, statistics: Statistics
+) -> Float[Array, "member batch K_times_obs_and_action"]:
+    """What enters a context encoder; state differences are not normalised (fact sheet B.3)."""
+    members, batch = history.action.shape[:2]
+    action = statistics.history_action.normalize(history.action)
+    flat = [history.obs_diff.reshape(members, batch, -1), action.reshape(members, batch, -1)]
+    return jnp.concatenate(flat, axis=-1)
 
 
 def network_input(

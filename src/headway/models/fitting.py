@@ -14,7 +14,8 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from headway.config import FittingConfig
-from headway.data import Episodes, History, Samples, segment_sums
+from headway.data import Episodes, Samples, segment_sums
+from headway.models.batches import Batch
 from headway.models.compilation import jit_networks
 from headway.models.dynamics import GaussianNet, MultiHeadDynamics, Statistics, network_input
 from headway.models.losses import (
@@ -25,6 +26,7 @@ from headway.models.losses import (
     negative_log_likelihood,
     oracle_loss,
 )
+from headway.models.relation import add_parts, intervene, relation_gradient, relation_parts
 from headway.tasks.base import Task
 
 
@@ -33,16 +35,8 @@ class FitState(eqx.Module):
 
     model: MultiHeadDynamics
     optimizer: optax.OptState
-
-
-class Batch(NamedTuple):
-    """Samples of every member; leading axes [member, sample]."""
-
-    obs: Float[Array, "member sample obs"]
-    action: Float[Array, "member sample action"]
-    next_obs: Float[Array, "member sample obs"]
-    history: History
-    weight: Float[Array, "member sample"]
+    relation_optimizer: optax.OptState | None = None
+    """Adam's moments for the relation loss, which has an Adam of its own (RIA)."""
 
 
 class HeadLosses(NamedTuple):
@@ -97,14 +91,18 @@ class FitSetup(eqx.Module):
     def init(self, model: MultiHeadDynamics) -> FitState:
         """Start fitting a new model."""
         parameters: Any = model
-        return FitState(model, self.optimizer.init(parameters))
+        state = FitState(model, self.optimizer.init(parameters))
+        if model.relation_head is None:
+            return state
+        parameters = relation_parts(model)
+        return FitState(model, state.optimizer, self.optimizer.init(parameters))
 
 
 def head_losses(
     model: MultiHeadDynamics, task: Task, statistics: Statistics, batch: Batch
 ) -> HeadLosses:
     """Loss of every head on every sample, with the context of the sample's history."""
-    context = model.context(batch.history, statistics)
+    context = model.context(batch.history, statistics, batch.sim_params)
 
     def losses(net: GaussianNet, start, end, delta) -> Float[Array, "member head sample"]:
         x = network_input(task, statistics, start, batch.action)
@@ -168,8 +166,10 @@ def assign_segments(
 
     def assign_episode(episode: Int[Array, ""]) -> Assignment:
         obs, action = episodes.obs[episode], episodes.action[episode]
-        past = episodes.history(jnp.full_like(time, episode), time, setup.history_length)
-        batch = Batch(obs[:-1], action, obs[1:], past, jnp.ones(steps))
+        row = jnp.full_like(time, episode)
+        past = episodes.history(row, time, setup.history_length)
+        physics = episodes.sim_params[row]
+        batch = Batch(obs[:-1], action, obs[1:], past, jnp.ones(steps), physics)
         batch = jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *x.shape)), batch)
         losses = head_losses(model, setup.task, statistics, batch)
         valid = time < episodes.length[episode]
@@ -206,6 +206,8 @@ def gather_batch(
         next_obs=episodes.obs[episode, step + 1],
         history=episodes.history(episode, anchor, setup.history_length),
         weight=weight,
+        sim_params=episodes.sim_params[episode],
+        trajectory=episode,
     )
     if assignment is None:
         return batch, None
@@ -221,12 +223,23 @@ def update(
 
     def objective(model):
         losses = head_losses(model, setup.task, data.statistics, batch)
-        return total_loss(model, losses, owners, batch.weight, setup.config)
+        loss, forward = total_loss(model, losses, owners, batch.weight, setup.config)
+        if model.relation_head is None:
+            return loss, (forward, None)
+        pull, similar = intervene(model, setup.task, data.statistics, batch, setup.config)
+        return loss + pull, (forward, similar)
 
-    (loss, forward), grads = jax.value_and_grad(objective, has_aux=True)(state.model)
+    (loss, (forward, similar)), grads = jax.value_and_grad(objective, has_aux=True)(state.model)
     changes, optimizer = setup.optimizer.update(grads, state.optimizer)
     stepped = FitState(eqx.apply_updates(state.model, changes), optimizer)
     finite = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(grads))
+    if similar is not None:
+        # Both gradients are taken at the same weights, each with an Adam of its own.
+        decay = setup.config.weight_decay
+        relation, grads = relation_gradient(state.model, data.statistics, batch, similar, decay)
+        changes, moments = setup.optimizer.update(grads, state.relation_optimizer)
+        stepped = FitState(add_parts(stepped.model, changes), stepped.optimizer, moments)
+        finite &= jnp.isfinite(relation) & jnp.isfinite(optax.tree.norm(grads))
     kept = jax.tree.map(functools.partial(jnp.where, finite), stepped, state)
     return kept, (jnp.where(finite, loss, 0.0), jnp.where(finite, forward, 0.0), ~finite)
 

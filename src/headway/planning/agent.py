@@ -1,5 +1,6 @@
 """An agent: recent history, head selection, and a planner around a dynamics model."""
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,8 +10,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from headway.config import PlannerConfig
+from headway.data import sim_params_row
+from headway.errors import ConfigError
 from headway.models.compilation import jit_networks
 from headway.models.dynamics import MultiHeadDynamics, Statistics
+from headway.planning.adaptation import LastLayer, Observed, Prior, Seen, update
+from headway.planning.devices import whole_on_each
 from headway.planning.heads import RecentTransitions, head_errors, select_heads
 from headway.planning.imagination import ImaginedDynamics
 from headway.planning.optimizers import SearchState, make_optimizer, where_env
@@ -27,6 +32,10 @@ class AgentState(NamedTuple):
     acted: Bool[Array, " env"]
     search: SearchState
     key: PRNGKeyArray
+    sim_params: Float[Array, "env sim_param"] | None = None
+    """The true simulator parameters, for a model that is told them."""
+    learned: LastLayer | None = None
+    """What the heads learned in this episode."""
 
 
 class Decision(NamedTuple):
@@ -34,8 +43,9 @@ class Decision(NamedTuple):
 
     action: Float[Array, "env action"]
     """The action to take, in [-1, 1]."""
-    heads: Int[Array, "env member"]
-    """The head each member plans with; with `average`, the one that would be adaptive."""
+    heads: Int[Array, "env member"] | None
+    """The head each member plans with; with `average`, the one that would be adaptive. None
+    where a model has no heads."""
     failures: Int[Array, " env"]
     """Planner iterations without any finite return."""
     evaluations: Int[Array, " env"]
@@ -54,9 +64,43 @@ class Agent(eqx.Module):
     task: Task
     planner: PlannerConfig = eqx.field(static=True)
     history_length: int = eqx.field(static=True)
+    prior: Prior | None = None
+    """Where heads that keep learning start; `prior.fit_prior` finds it."""
 
-    def init(self, num_envs: int, *, key: PRNGKeyArray) -> AgentState:
-        """Remember nothing yet of `num_envs` environments."""
+    def __check_init__(self):
+        if self.planner.adaptation != "none" and self.prior is None:
+            raise ConfigError(
+                "planner.adaptation is 'last-layer', but the agent has no prior; make it with"
+                " headway.planning.prior.fit_prior, or set planner.adaptation to none."
+            )
+
+    @property
+    def sim_param_names(self) -> tuple[str, ...]:
+        """The true simulator parameters that the model must be told; mostly none."""
+        return self.model.sim_param_names
+
+    def init(
+        self,
+        num_envs: int,
+        *,
+        key: PRNGKeyArray,
+        sim_params: Sequence[Mapping[str, float]] | None = None,
+    ) -> AgentState:
+        """Remember nothing yet of `num_envs` environments.
+
+        Args:
+            num_envs: How many environments.
+            key: The planner's draws.
+            sim_params: The true simulator parameters of each environment. Only a model with
+                `model.context="sim-params"` looks at them.
+
+        Raises:
+            ConfigError: The model is told simulator parameters, and one has no value.
+        """
+        physics, names = None, self.sim_param_names
+        if names:
+            rows = [sim_params_row(row, names) for row in sim_params or [{}]]
+            physics = jnp.broadcast_to(np.stack(rows), (num_envs, len(names)))
         slots = max(self.history_length, self.planner.selection_length)
         action_size = self.task.action_size
         return AgentState(
@@ -66,6 +110,8 @@ class Agent(eqx.Module):
             jnp.zeros(num_envs, bool),
             make_optimizer(self.planner).init(num_envs, self.planner.horizon, action_size),
             key,
+            physics,
+            fresh_layer(self, num_envs),
         )
 
     def act(
@@ -83,16 +129,19 @@ def _act(
     # 1. Remember the transition that the last action caused.
     recent = state.recent.push(state.obs, state.action, obs, state.acted)
     # 2. Encode the recent past, once per member, for the whole plan.
-    context = encode(agent, recent)
-    # 3. Choose the head that best explains the recent past.
+    context = encode(agent, recent, state.sim_params)
+    # 3. Learn from that transition, where heads keep learning.
+    learned = learn(agent, state.learned, recent, context, state.acted)
+    # 4. Choose the head that best explains the recent past.
     heads = choose_heads(agent, recent, context, error_key=error_key, head_key=head_key)
-    # 4. Imagine candidates with it, and search for the best action sequence.
+    # 5. Imagine candidates with it, and search for the best action sequence.
     dynamics = ImaginedDynamics.fold(
         agent.model,
         agent.statistics,
         planning_heads(agent, heads),
         context,
         precision=agent.planner.precision,
+        correction=None if learned is None else learned.correction(),
     )
     settings = RolloutSettings.of(agent.planner, agent.model.num_members)
 
@@ -101,24 +150,58 @@ def _act(
 
     optimizer = make_optimizer(agent.planner)
     plan = optimizer.optimize(score, state.search, key=plan_key)
-    # 5. Take the first action; where the search ended, one step later, is the next start.
+    # 6. Take the first action; where the search ended, one step later, is the next start.
     action = plan.actions[:, 0]
     acted = jnp.ones_like(state.acted)
-    state = AgentState(recent, obs, action, acted, optimizer.shift(plan.state), key)
-    return state, Decision(action, heads, plan.failures, plan.evaluations)
+    search = optimizer.shift(plan.state)
+    state = AgentState(recent, obs, action, acted, search, key, state.sim_params, learned)
+    decision = Decision(action, heads, plan.failures, plan.evaluations)
+    return whole_on_each((state, decision), agent.planner.devices)
 
 
 _act_float32 = jit_networks(_act)
 _act_bfloat16 = jit_networks(_act, precision="bfloat16")
 
 
-def encode(agent: Agent, recent: RecentTransitions) -> Float[Array, "member env context"] | None:
+def encode(
+    agent: Agent,
+    recent: RecentTransitions,
+    sim_params: Float[Array, "env sim_param"] | None = None,
+) -> Float[Array, "member env context"] | None:
     """The context vector of every member and environment."""
     members = agent.model.num_members
-    history = jax.tree.map(
-        lambda x: jnp.broadcast_to(x, (members, *x.shape)), recent.history(agent.history_length)
+    history, sim_params = jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (members, *x.shape)),
+        (recent.history(agent.history_length), sim_params),
     )
-    return agent.model.context(history, agent.statistics)
+    return agent.model.context(history, agent.statistics, sim_params)
+
+
+def fresh_layer(agent: Agent, num_envs: int) -> LastLayer | None:
+    """What heads know of an episode that begins; None where they do not keep learning."""
+    if agent.planner.adaptation == "none" or agent.prior is None:
+        return None
+    _, num_heads, head_size, obs_size = agent.model.forward_net.mean_heads.weight.shape
+    groups = num_heads if agent.planner.adaptation_noise == "heads" else 1
+    sizes = num_heads, head_size + 1, obs_size
+    return LastLayer.of_prior(agent.prior, num_envs, sizes, groups=groups)
+
+
+def learn(
+    agent: Agent,
+    learned: LastLayer | None,
+    recent: RecentTransitions,
+    context: Float[Array, "member env context"] | None,
+    happened: Bool[Array, " env"],
+) -> LastLayer | None:
+    """Learn from the newest transition of every environment."""
+    if learned is None or agent.prior is None:
+        return None
+    newest = recent.obs[:, -1], recent.action[:, -1], recent.next_obs[:, -1]
+    seen = Seen.through(agent.model, agent.task, agent.statistics, newest, context)
+    by_heads = agent.planner.adaptation_noise == "heads"
+    reference = agent.prior.log_reference if by_heads else None
+    return update(learned, Observed.of(seen, happened, reference))
 
 
 def choose_heads(

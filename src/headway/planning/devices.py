@@ -3,10 +3,15 @@
 Decided when a plan is compiled. None of it changes a result beyond rounding.
 """
 
+from typing import Literal, TypeVar
+
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
+
+Tree = TypeVar("Tree")
+Devices = Literal["local", "all"]
 
 CPU_BUDGET = 4 * 2**20
 """Bytes that one array of activations may take on a CPU: more would leave its caches."""
@@ -35,14 +40,33 @@ def activation_budget() -> int:
     return sum(memory_budget(device.platform, device.memory_stats()) for device in devices)
 
 
-def spread_candidates(x: Array) -> Array:
-    """Share the last axis, the candidates, among all local devices, where it can be divided."""
-    devices = jax.local_devices()
-    if len(devices) == 1 or x.shape[-1] % len(devices):
+def spread_candidates(x: Array, devices: Devices = "local") -> Array:
+    """Share the last axis, the candidates, among devices, where it can be divided.
+
+    Args:
+        x: Any array whose last axis is the candidates.
+        devices: Those of this process, or of all processes together.
+    """
+    mesh = _mesh(devices)
+    if mesh.size == 1 or x.shape[-1] % mesh.size:
         return x
-    mesh = Mesh(np.array(devices), ("candidate",))
     spec = PartitionSpec(*[PartitionSpec.UNCONSTRAINED] * (x.ndim - 1), "candidate")
     return jax.lax.with_sharding_constraint(x, NamedSharding(mesh, spec))
+
+
+def whole_on_each(tree: Tree, devices: Devices) -> Tree:
+    """Give every device all of some arrays, where several processes share a plan.
+
+    So each process can read them.
+    """
+    if devices == "local" or jax.process_count() == 1:
+        return tree
+    return jax.lax.with_sharding_constraint(tree, NamedSharding(_mesh(devices), PartitionSpec()))
+
+
+def _mesh(devices: Devices) -> Mesh:
+    found = jax.devices() if devices == "all" else jax.local_devices()
+    return Mesh(np.array(found), ("candidate",))
 
 
 def memory_budget(platform: str, stats: dict[str, int] | None) -> int:

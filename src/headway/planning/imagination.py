@@ -5,14 +5,17 @@ weights differ; candidates come last, so that every elementwise operation, slice
 features runs over long contiguous rows, and what all candidates share is a plain broadcast.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from headway.models.dynamics import MultiHeadDynamics, Statistics
+from headway.models.dynamics import GaussianNet, MultiHeadDynamics, Statistics
 from headway.models.networks import Dense, DenseHeads, bound_logvar, swish
+from headway.tasks.base import Task
 
 PRECISIONS = {"float32": jnp.float32, "bfloat16": jnp.bfloat16}
 
@@ -37,30 +40,34 @@ class Layer(NamedTuple):
 
 
 class ChosenHeads(NamedTuple):
-    """The heads that one plan uses; means and log-variances come out of one product.
+    """What one plan has of each environment's own: its heads, and the context in a hidden layer.
 
-    The layer's outputs are the mean delta in raw units (averaged over the choices), then each
-    choice's log-variance.
+    Means and log-variances come out of one product: the layer's outputs are the mean delta in
+    raw units (averaged over the choices), then each choice's log-variance.
     """
 
     layer: Layer
     min_logvar: Float[Array, "*env member choice obs"] | None
     max_logvar: Float[Array, "*env member choice obs"] | None
+    context_bias: Float[Array, "*env member out"] | None = None
+    """Bias of the hidden layer that the context joins; None if it joins the heads."""
 
 
 class ImaginedDynamics(eqx.Module):
     """A dynamics model with all that is fixed during one plan folded into its weights.
 
     Only the chosen heads remain, one set per environment and member; the context has become
-    part of their biases; normalisation has gone into the first layer and de-normalisation
-    into the heads. With several chosen heads the sampled delta is the average of their
-    samples (non-adaptive planning), drawn in one go.
+    part of the biases where it joins; normalisation has gone into the first layer and
+    de-normalisation into the heads. With several chosen heads the sampled delta is the average
+    of their samples (non-adaptive planning), drawn in one go.
     """
 
     hidden: tuple[Layer, ...]
     heads: ChosenHeads
     """With a leading environment axis after `fold`, without one after `with_heads`."""
     delta_std: Float[Array, " obs"]
+    context_layer: int | None = eqx.field(static=True, default=None)
+    """The hidden layer that the context joins; None if it joins the heads, or there is none."""
 
     @classmethod
     def fold(
@@ -71,6 +78,7 @@ class ImaginedDynamics(eqx.Module):
         context: Float[Array, "member env context"] | None,
         *,
         precision: str = "float32",
+        correction: DenseHeads | None = None,
     ) -> "ImaginedDynamics":
         """Fold a model for one plan.
 
@@ -81,16 +89,21 @@ class ImaginedDynamics(eqx.Module):
             context: The context vector of each member and environment.
             precision: Of the products' inputs, `float32` or `bfloat16`. The first layer stays
                 in float32: it takes raw observations, whose offsets bfloat16 would not resolve.
+            correction: Added to the mean heads, with a leading environment axis (`adaptation`).
         """
         net = model.forward_net
         dtype = PRECISIONS[precision]
-        first, *others = net.hidden
+        (first, *others), shift = _hidden_without_context(net, context)
         hidden = (
             _layer(_fold_input(first, statistics), jnp.float32),
             *(_layer(layer, dtype) for layer in others),
         )
+        context_bias, place = None, None
+        if shift is not None:
+            place, context = net.context_layer, None
+            context_bias = hidden[place].bias + shift
         delta = statistics.delta
-        mean_weight, mean_bias = _chosen(net.mean_heads, heads, context)
+        mean_weight, mean_bias = _chosen(net.mean_heads, heads, context, correction)
         weights = [mean_weight.mean(2) * delta.std]
         biases = [mean_bias.mean(2) * delta.std + delta.mean]
         low = high = None
@@ -103,11 +116,28 @@ class ImaginedDynamics(eqx.Module):
             low, high = net.min_logvar[heads], net.max_logvar[heads]
         weight = jnp.concatenate(weights, axis=-1).mT.astype(dtype)
         output = Layer(weight, jnp.concatenate(biases, axis=-1))
-        return cls(hidden, ChosenHeads(output, low, high), delta.std)
+        heads_and_context = ChosenHeads(output, low, high, context_bias)
+        return cls(hidden, heads_and_context, delta.std, place)
 
     def with_heads(self, heads: ChosenHeads) -> "ImaginedDynamics":
         """The dynamics of one environment, whose heads have no environment axis."""
-        return ImaginedDynamics(self.hidden, heads, self.delta_std)
+        hidden = [*self.hidden]
+        if self.context_layer is not None and heads.context_bias is not None:
+            layer = hidden[self.context_layer]
+            hidden[self.context_layer] = layer._replace(bias=heads.context_bias)
+        return ImaginedDynamics(tuple(hidden), heads, self.delta_std, self.context_layer)
+
+    @property
+    def per_env(self) -> ChosenHeads:
+        """See `Dynamics.per_env`."""
+        return self.heads
+
+    of_env = with_heads
+
+    @property
+    def widest(self) -> int:
+        """See `Dynamics.widest`."""
+        return max(layer.bias.shape[-1] for layer in self.hidden)
 
     @property
     def num_members(self) -> int:
@@ -118,6 +148,22 @@ class ImaginedDynamics(eqx.Module):
     def stochastic(self) -> bool:
         """Whether deltas have a variance."""
         return self.heads.min_logvar is not None
+
+    def start(self) -> tuple[()]:
+        """See `Dynamics.start`; nothing is carried from step to step."""
+        return ()
+
+    def step(
+        self,
+        task: Task,
+        carry: tuple[()],
+        obs: Float[Array, "member obs particle candidate"],
+        action: Float[Array, "member action particle candidate"],
+        noise: Float[Array, "member obs particle #candidate"] | None,
+    ) -> tuple[tuple[()], Float[Array, "member obs particle candidate"]]:
+        """See `Dynamics.step`."""
+        x = jnp.concatenate([over_rows(task.preprocess)(obs), action], axis=1)
+        return carry, over_rows(task.postprocess)(obs, self.sample_delta(x, noise))
 
     def sample_delta(
         self,
@@ -160,6 +206,19 @@ def _layer(layer: Dense, dtype) -> Layer:
     return Layer(layer.weight.mT.astype(dtype), layer.bias)
 
 
+def _hidden_without_context(
+    net: GaussianNet, context: Float[Array, "member env context"] | None
+) -> tuple[tuple[Dense, ...], Float[Array, "env member out"] | None]:
+    """The hidden layers without the rows that take the context, and what those rows add."""
+    if context is None or net.context_layer is None:
+        return net.hidden, None
+    layer = net.hidden[net.context_layer]
+    width = layer.weight.shape[1] - context.shape[-1]
+    narrow = Dense(layer.weight[:, :width], layer.bias)
+    hidden = (*net.hidden[: net.context_layer], narrow, *net.hidden[net.context_layer + 1 :])
+    return hidden, jnp.einsum("mec,mco->emo", context, layer.weight[:, width:])
+
+
 def _fold_input(layer: Dense, statistics: Statistics) -> Dense:
     """Let the first layer take raw features and actions."""
     scale = jnp.concatenate([statistics.features.scale, statistics.action.scale])
@@ -172,12 +231,22 @@ def _chosen(
     layer: DenseHeads,
     heads: Int[Array, "env member choice"],
     context: Float[Array, "member env context"] | None,
+    correction: DenseHeads | None = None,
 ) -> tuple[Float[Array, "env member choice hidden obs"], Float[Array, "env member choice obs"]]:
     """Weights and biases of the chosen heads, the context added to the biases."""
     member = jnp.arange(heads.shape[1])[:, None]
     weight, bias = layer.weight[member, heads], layer.bias[member, heads]
+    if correction is not None:
+        env = jnp.arange(len(heads))[:, None, None]
+        weight = weight + correction.weight[env, member, heads]
+        bias = bias + correction.bias[env, member, heads]
     if context is None:
         return weight, bias
     hidden_size = weight.shape[-2] - context.shape[-1]
     bias = bias + jnp.einsum("mec,emkco->emko", context, weight[..., hidden_size:, :])
     return weight[..., :hidden_size, :], bias
+
+
+def over_rows(function: Callable) -> Callable:
+    """Let a Task's method, which wants features last, take [member, feature, *rows]."""
+    return jax.vmap(jax.vmap(function, in_axes=-1, out_axes=-1), in_axes=-1, out_axes=-1)

@@ -2,15 +2,15 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.config import PlannerConfig
-from headway.planning.devices import environments_at_once, spread_candidates
-from headway.planning.imagination import ChosenHeads, ImaginedDynamics
+from headway.planning.devices import Devices, environments_at_once, spread_candidates
+from headway.planning.imagination import over_rows
 from headway.tasks.base import Task
 
 
@@ -23,6 +23,8 @@ class RolloutSettings:
     """Whether all candidates of a step share the noise of their particles."""
     released_reward: bool = False
     """Whether to plan with the released code's reward."""
+    devices: Devices = "local"
+    """Which devices share the candidates."""
 
     @classmethod
     def of(cls, planner: PlannerConfig, num_members: int) -> "RolloutSettings":
@@ -31,11 +33,67 @@ class RolloutSettings:
             planner.num_particles // num_members,
             planner.particle_noise == "shared",
             planner.reward == "released",
+            planner.devices,
         )
 
 
+@runtime_checkable
+class Dynamics(Protocol):
+    """What one plan imagines with; arrays are [member, feature, particle, candidate]."""
+
+    @property
+    def num_members(self) -> int:
+        """Models that imagine side by side."""
+        ...
+
+    @property
+    def stochastic(self) -> bool:
+        """Whether `step` uses noise."""
+        ...
+
+    @property
+    def widest(self) -> int:
+        """Numbers in the widest layer of one step; decides how much is imagined at once."""
+        ...
+
+    @property
+    def per_env(self) -> Any:
+        """The arrays that differ between environments; these lead."""
+        ...
+
+    def of_env(self, part: Any) -> "Dynamics":
+        """The dynamics of one environment, whose arrays have no such axis."""
+        ...
+
+    def start(self) -> Any:
+        """What one environment's rollouts carry from step to step; arrays [member, size]."""
+        ...
+
+    def step(
+        self,
+        task: Task,
+        carry: Any,
+        obs: Float[Array, "member obs particle candidate"],
+        action: Float[Array, "member action particle candidate"],
+        noise: Float[Array, "member obs particle #candidate"] | None,
+    ) -> tuple[Any, Float[Array, "member obs particle candidate"]]:
+        """One imagined step of one environment.
+
+        Args:
+            task: How observations enter and leave a model.
+            carry: From the last step.
+            obs: Where each rollout is.
+            action: What it does, in [-1, 1].
+            noise: Standard normal draws; None predicts the mean.
+
+        Returns:
+            What to carry on, and the next observations.
+        """
+        ...
+
+
 def candidate_returns(
-    dynamics: ImaginedDynamics,
+    dynamics: Dynamics,
     task: Task,
     obs: Float[Array, "env obs"],
     candidates: Float[Array, "env candidate horizon action"],
@@ -61,14 +119,13 @@ def candidate_returns(
     num_envs, num_candidates = candidates.shape[:2]
     keys = jax.vmap(functools.partial(jax.random.fold_in, key))(jnp.arange(num_envs))
 
-    def of_one(heads, obs, candidates, key):
-        one = dynamics.with_heads(heads)
+    def of_one(part, obs, candidates, key):
+        one = dynamics.of_env(part)
         return _environment_returns(one, task, obs, candidates, settings=settings, key=key)
 
-    widest = max(layer.bias.shape[-1] for layer in dynamics.hidden)
     rows = num_candidates * settings.particles_per_member * dynamics.num_members
-    at_once = environments_at_once(num_envs, 4 * widest * rows)
-    args: tuple[ChosenHeads, Array, Array, PRNGKeyArray] = (dynamics.heads, obs, candidates, keys)
+    at_once = environments_at_once(num_envs, 4 * dynamics.widest * rows)
+    args: tuple[Any, Array, Array, PRNGKeyArray] = (dynamics.per_env, obs, candidates, keys)
     if at_once == num_envs:
         return jax.vmap(of_one)(*args)
     batch_size = at_once if at_once > 1 else None
@@ -76,7 +133,7 @@ def candidate_returns(
 
 
 def _environment_returns(
-    dynamics: ImaginedDynamics,
+    dynamics: Dynamics,
     task: Task,
     obs: Float[Array, " obs"],
     candidates: Float[Array, "candidate horizon action"],
@@ -91,56 +148,36 @@ def _environment_returns(
     reward_of = task.released_reward if settings.released_reward else task.reward
     reward_of, terminated = over_rows(reward_of), over_rows(task.terminated)
     scale_action = over_rows(task.scale_action)
+    spread = functools.partial(spread_candidates, devices=settings.devices)
 
     def imagine(carry, step):
-        obs, alive, total = carry
+        obs, alive, total, memory = carry
         scaled, noise = step
-        scaled = spread_candidates(
-            jnp.broadcast_to(scaled[:, None], (members, action_size, *rows[1:]))
-        )
-        next_obs = imagine_step(dynamics, task, obs, scaled, draw(noise, obs.shape))
+        scaled = spread(jnp.broadcast_to(scaled[:, None], (members, action_size, *rows[1:])))
+        memory, next_obs = dynamics.step(task, memory, obs, scaled, draw(noise, obs.shape))
         action = scale_action(scaled)
         total = total + jnp.where(alive, reward_of(obs, action, next_obs), 0.0)
         alive = alive & ~terminated(obs, action, next_obs)
-        return (next_obs, alive, total), None
+        return (next_obs, alive, total, memory), None
 
     def draw(noise, shape):
         if not dynamics.stochastic:
             return None
         if settings.shared_noise:
             return noise[..., None]
-        return spread_candidates(jax.random.normal(noise, shape))
+        return spread(jax.random.normal(noise, shape))
 
     if settings.shared_noise and dynamics.stochastic:
         noise = jax.random.normal(key, (horizon, members, obs.shape[0], particles))
     else:
         noise = jax.random.split(key, horizon)
-    start = jnp.broadcast_to(obs[:, None, None], (members, obs.shape[0], *rows[1:]))
-    carry = spread_candidates(start), jnp.ones(rows, bool), jnp.zeros(rows)
-    (_, _, total), _ = jax.lax.scan(imagine, carry, (candidates.transpose(1, 2, 0), noise))
+
+    def wide(values):
+        return spread(
+            jnp.broadcast_to(values[..., None, None], (members, values.shape[-1], *rows[1:]))
+        )
+
+    memory = jax.tree.map(wide, dynamics.start())
+    carry = wide(obs), jnp.ones(rows, bool), jnp.zeros(rows), memory
+    (_, _, total, _), _ = jax.lax.scan(imagine, carry, (candidates.transpose(1, 2, 0), noise))
     return total.mean((0, 1))
-
-
-def imagine_step(
-    dynamics: ImaginedDynamics,
-    task: Task,
-    obs: Float[Array, "member obs particle candidate"],
-    action: Float[Array, "member action particle candidate"],
-    noise: Float[Array, "member obs particle #candidate"] | None,
-) -> Float[Array, "member obs particle candidate"]:
-    """One imagined step of one environment.
-
-    Args:
-        dynamics: The model, folded, with one environment's heads.
-        task: How observations enter and leave the model.
-        obs: Where each rollout is.
-        action: What it does, in [-1, 1].
-        noise: Standard normal draws; None predicts the mean.
-    """
-    x = jnp.concatenate([over_rows(task.preprocess)(obs), action], axis=1)
-    return over_rows(task.postprocess)(obs, dynamics.sample_delta(x, noise))
-
-
-def over_rows(function: Callable) -> Callable:
-    """Let a Task's method, which wants features last, take [member, feature, *rows]."""
-    return jax.vmap(jax.vmap(function, in_axes=-1, out_axes=-1), in_axes=-1, out_axes=-1)

@@ -50,7 +50,7 @@ def save_run_figures(run_dir: str | Path) -> list[Path]:
 def learning_curve(run: RunDir, config: Config) -> Path | None:
     """Draw the returns over environment steps (supplement, Fig. 9)."""
     metrics = run.metrics()
-    if not metrics:
+    if not metrics or "collection" not in metrics[0]:  # nothing was learned
         return None
     path = run.figures / "learning_curve.png"
     episodes = len(metrics[0]["collection"]["returns"])

@@ -34,7 +34,7 @@ _MARGIN, _TITLE, _LEGEND = 0.16, 0.42, 0.3  # inches
 _LEGEND_SYMBOL, _LEGEND_LETTER, _LEGEND_LINE = 0.5, 0.062, 0.19  # inches
 _CAPTION_LINE, _CAPTION_LETTER = 0.155, 0.055  # inches
 
-_SETTINGS: dict[Any, Any] = {
+SETTINGS: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
     "font.size": 9.0,
@@ -69,11 +69,14 @@ _SETTINGS: dict[Any, Any] = {
     "lines.solid_capstyle": "round",
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
+    "svg.hashsalt": "headway",
 }
 
 
 @contextlib.contextmanager
-def figure(path: Path, *, title: str, caption: str, size: tuple[float, float]) -> Iterator[Figure]:
+def figure(
+    path: Path, *, title: str, caption: str, size: tuple[float, float], svg: bool = False
+) -> Iterator[Figure]:
     """Make a figure, hand it out to be drawn on, and write it.
 
     Args:
@@ -81,8 +84,9 @@ def figure(path: Path, *, title: str, caption: str, size: tuple[float, float]) -
         title: One line that says what is seen.
         caption: What the marks are and where the numbers come from; wrapped to the width.
         size: Width and height in inches.
+        svg: Whether to write an SVG file beside the PNG as well.
     """
-    with matplotlib.rc_context(_SETTINGS):
+    with matplotlib.rc_context(SETTINGS):
         width, height = size
         drawing = Figure(figsize=size)
         FigureCanvasAgg(drawing)
@@ -99,6 +103,10 @@ def figure(path: Path, *, title: str, caption: str, size: tuple[float, float]) -
         image = io.BytesIO()
         drawing.savefig(image, format="png", dpi=DPI)
         files.write_bytes(path, image.getvalue())
+        if svg:
+            drawn = io.BytesIO()
+            drawing.savefig(drawn, format="svg", metadata={"Date": None})
+            files.write_bytes(path.with_suffix(".svg"), drawn.getvalue())
 
 
 def legend(drawing: Figure, handles: Sequence[Any] | None = None) -> None:

@@ -1,0 +1,211 @@
+"""`headway reproduce` and `headway sweep`: what they take, and what they print."""
+
+import dataclasses
+import json
+import re
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from headway.cli.arguments import Flag
+from headway.cli.arguments import _unset as unset
+from headway.cli.output import print_json, print_tables
+from headway.cli.usage import UsageError, parse
+
+if TYPE_CHECKING:
+    from headway.sweeps.jobs import Comparison
+
+PAPER_ENVS = (
+    "cartpole-swingup", "pendulum", "hopper", "slim-humanoid", "half-cheetah", "crippled-ant",
+)  # fmt: skip
+MAX_SEEDS = 1000
+
+
+@dataclasses.dataclass(frozen=True)
+class _Runs:
+    """Options of both commands."""
+
+    envs: Annotated[tuple[str, ...], unset("the paper's six")] = PAPER_ENVS
+    """Environments; `headway list envs` shows them."""
+    seeds: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SEED|FROM:TO")] = ("0:3",)
+    """Seeds, or ranges without their end: 0:3 is 0 1 2."""
+    preset: str = "paper"
+    """At which scale; `headway list presets` shows the choice."""
+    out: Path = Path("runs/reproduce")
+    """Where runs and results go; runs that are there already are used."""
+    dry_run: Flag = False
+    """List what would be run and about how long it takes, and run nothing."""
+    one_by_one: Flag = False
+    """Let runs go one after another in this process, even where Ray is installed."""
+    address: Annotated[str | None, unset("Ray on this machine")] = None
+    """A Ray cluster, for example `auto`; it must see --out under the same path."""
+    cpus_per_run: float = 1.0
+    """Cores that one run reserves, and threads that it computes with."""
+    gpus_per_run: Annotated[float | None, unset("1 where there are GPUs")] = None
+    """GPUs that one run reserves; a fraction lets several share one."""
+    json: Flag = False
+    """Print one JSON line on stdout instead of tables."""
+    quiet: Flag = False
+    """Show no progress."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Experiment:
+    """The argument of `headway reproduce`."""
+
+    experiment: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="EXPERIMENT")]
+    """An experiment; `headway list experiments` shows them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reproduce(_Runs, _Experiment):
+    """Run what is missing of an experiment of the paper, and draw and tabulate it."""
+
+    settings: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    """Settings of every arm, for example collection.num_iterations=3."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep(_Runs):
+    """Run methods in environments with seeds and settings, all of them with each other."""
+
+    methods: tuple[str, ...] = ("tmcl",)
+    """Methods; `headway list methods` shows them."""
+    settings: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE[,VALUE...]")] = ()
+    """Settings with one or several values, for example planner.horizon=10,20."""
+    name: str = "sweep"
+    """Names the folder of results in --out."""
+
+
+def reproduce(words: Sequence[str]) -> int:
+    """`headway reproduce`."""
+    default = Reproduce(experiment=tyro.MISSING)
+    arguments = parse(Reproduce, default, words, "headway reproduce")
+    from headway.sweeps.experiments import experiment
+
+    chosen = {}
+    for name, values in read_settings(arguments.settings).items():
+        if len(values) > 1:
+            raise UsageError(f"--settings {name} has {len(values)} values, allowed: one of each.")
+        chosen[name] = values[0]
+    found = experiment(arguments.experiment)
+    return _compare(found, arguments, chosen, ["reproduce", *words])
+
+
+def sweep(words: Sequence[str]) -> int:
+    """`headway sweep`."""
+    arguments = parse(Sweep, Sweep(), words, "headway sweep")
+    from headway.sweeps.experiments import sweep_experiment
+
+    grid = read_settings(arguments.settings)
+    found = sweep_experiment(arguments.name, arguments.methods, grid)
+    return _compare(found, arguments, {}, ["sweep", *words])
+
+
+def _compare(
+    experiment: Any, arguments: Reproduce | Sweep, settings: dict[str, Any], words: list[str]
+) -> int:
+    from headway.sweeps.jobs import Comparison
+
+    comparison = Comparison(
+        experiment,
+        arguments.envs,
+        read_seeds(arguments.seeds),
+        arguments.preset,
+        arguments.out,
+        settings,
+    )
+    if arguments.dry_run:
+        return _print_plan(comparison, arguments.json)
+    from headway import compare
+    from headway.sweeps.board import make_board
+    from headway.sweeps.running import Workers
+
+    command = shlex.join(["headway", *words])
+    workers = Workers(
+        arguments.one_by_one, arguments.address, arguments.cpus_per_run, arguments.gpus_per_run
+    )
+    board = make_board(arguments.quiet)
+    done = compare.reproduce(comparison, workers=workers, board=board, command=command)
+    for path, reason in done.failures.items():
+        print(f"failed: {path}: {reason}", file=sys.stderr)
+    if arguments.json:
+        print_json(_facts(done))
+    else:
+        from headway.report.comparison_tables import results
+
+        print_tables(*results(done.found))
+        print("Written:", *done.files, sep="\n  ")
+        print("The command, which resumes what was interrupted:", command, sep="\n  ")
+    return 1 if done.failures else 0
+
+
+def _facts(done: Any) -> dict[str, Any]:
+    comparison = done.found.comparison
+    return {
+        "experiment": comparison.experiment.name,
+        "runs": len(comparison.jobs),
+        "failures": {str(path): reason for path, reason in done.failures.items()},
+        "returns": [point._asdict() for point in done.found.final_points],
+        "files": [str(path) for path in done.files],
+    }
+
+
+def _print_plan(comparison: "Comparison", as_json: bool) -> int:
+    from headway.report.comparison_tables import plan
+    from headway.sweeps.cost import make_plan
+
+    entries, table = plan(comparison, make_plan(comparison.jobs))
+    if as_json:
+        return print_json(entries)
+    print_tables(table)
+    return 0
+
+
+def read_seeds(words: Sequence[str]) -> tuple[int, ...]:
+    """Read seeds and ranges, for example `0:3` or `0 4`.
+
+    Raises:
+        UsageError: A word is neither.
+    """
+    seeds: list[int] = []
+    for word in words:
+        found = re.fullmatch(r"(\d{1,10})(?::(\d{1,10}))?", word)
+        if not found:
+            raise UsageError(f"--seeds is {word!r}, allowed: whole numbers, or ranges as 0:3.")
+        first = int(found[1])
+        last = int(found[2]) if found[2] else first + 1
+        if not 0 < last - first <= MAX_SEEDS:
+            raise UsageError(f"--seeds is {word!r}, allowed: 1 to {MAX_SEEDS} seeds.")
+        seeds += range(first, last)
+    return tuple(seeds)
+
+
+def read_settings(words: Sequence[str]) -> dict[str, list[Any]]:
+    """Read `NAME=VALUE` and `NAME=VALUE,VALUE`; values are JSON, or text where they are not.
+
+    Raises:
+        UsageError: A word is not of that form.
+    """
+    grid: dict[str, list[Any]] = {}
+    for word in words:
+        name, equals, values = word.partition("=")
+        name = name.lstrip("-").replace("-", "_")
+        parts = re.findall(r"(?:\[[^\]]*\]|[^,\[])+", values)
+        if not (name and equals and parts) or name in grid:
+            raise UsageError(
+                f"--settings is {word!r}, allowed: NAME=VALUE or NAME=VALUE,VALUE, each name once."
+            )
+        grid[name] = [_value(part) for part in parts]
+    return grid
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text

@@ -1,0 +1,91 @@
+"""What every kind of model keeps to: it begins, is fitted, acts, and says what it has learned."""
+
+import abc
+from collections.abc import Callable, Generator, Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from headway.config import Config
+from headway.data import Trajectory
+from headway.experiment.rollouts import Arena
+from headway.models.fitting import EpochStats
+from headway.planning.acting import Acting
+from headway.tasks.base import Task
+
+
+class Learned(NamedTuple):
+    """What a checkpoint holds; pytrees of arrays."""
+
+    fit: Any
+    """Weights and the optimiser's moments, as an epoch takes and returns them."""
+    statistics: Any
+    """Normalisers of the data that they were fitted to."""
+
+
+Epochs = Generator[tuple[Any, EpochStats], None, None]
+
+
+class Fit(NamedTuple):
+    """A fit to all data of an iteration, ready to run."""
+
+    statistics: Any
+    """The normalisers, renewed."""
+    epochs: Callable[[Any, int], Epochs]
+    """Goes on from a fit state with some epoch; yields the state after each, and its averages."""
+
+
+class Learner(abc.ABC):
+    """One kind of model, for one run.
+
+    Args:
+        config: Settings of the run.
+        task: Its Task.
+        episode_length: Steps of an episode.
+    """
+
+    learns: ClassVar[bool] = True
+    """Whether anything is fitted; without, a run only tests."""
+
+    def __init__(self, config: Config, task: Task, episode_length: int):
+        self.config = config
+        self.task = task
+        self.episode_length = episode_length
+
+    @abc.abstractmethod
+    def initial(self, key: PRNGKeyArray) -> Learned:
+        """Draw what is not trained yet."""
+
+    @abc.abstractmethod
+    def fit(self, trajectories: list[Trajectory], iteration: int, key: PRNGKeyArray) -> Fit:
+        """Prepare to fit everything collected so far; the key alone decides what is drawn."""
+
+    @abc.abstractmethod
+    def agent(
+        self,
+        learned: Learned,
+        arena: Arena | None = None,
+        trajectories: Sequence[Trajectory] = (),
+    ) -> Acting:
+        """The agent that acts with what was learned.
+
+        Args:
+            learned: What was learned.
+            arena: Where it acts, if that is known; only the simulator asks.
+            trajectories: What it was learned from; only heads that keep learning ask.
+        """
+
+    def head_shares(
+        self, learned: Learned, trajectories: list[Trajectory]
+    ) -> Sequence[dict[str, Any]]:
+        """Rows of `assignments.csv`, without the iteration; none where there are no heads."""
+        del learned, trajectories
+        return ()
+
+    def prediction_error(
+        self, learned: Learned, trajectories: list[Trajectory], key: PRNGKeyArray
+    ) -> Float[np.ndarray, " step"]:
+        """Error by imagined step over some episodes; empty where nothing was learned."""
+        del learned, trajectories, key
+        return np.zeros(0)

@@ -1,0 +1,218 @@
+"""Heads that keep learning while they act: a Bayesian last layer for every episode.
+
+What a head's mean misses is modelled as a linear function of the features φ that the head sees:
+the backbone's output, the context and a 1. For every environment, member, head and dimension o,
+
+    r_o = φᵀ w_o + ε,    w_o ~ N(0, σ_o² ρ I),    ε ~ N(0, σ_o² n),
+
+where r is the normalised delta minus the head's mean, ρ and σ² come from the training data
+(`prior`), and n is 1 or says how noisy the head holds this transition to be. The posterior
+covariance is σ_o² P, and P depends on the features only, so the dimensions share it.
+
+Every transition is one step of a Kalman filter, in closed form. The chosen head's posterior mean
+is then added to its weights before the plan, so imagined rollouts cost nothing more. With
+`forgetting` the weights follow an Ornstein-Uhlenbeck process whose stationary distribution is
+the prior: P never exceeds ρ I, however long an episode is.
+
+Sources: Bayesian linear regression (Bishop, 2006, section 3.3); ALPaCA (Harrison et al., 2018);
+Potter's square-root filter (Maybeck, 1979, section 7.3).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from headway.models.dynamics import MultiHeadDynamics, Statistics, network_input
+from headway.models.networks import DenseHeads
+from headway.tasks.base import Task
+
+BELIEVABLE = 100.0
+"""Deviations of the training data's deltas; heads do not learn from a larger residual."""
+MAX_FEATURES = 1e8
+"""Squared norm of the features; heads do not learn from larger ones."""
+MAX_LOG_NOISE = 7.0
+"""Largest logarithm of the relative noise, either way."""
+TINY = 1e-12
+
+
+class Prior(NamedTuple):
+    """What an episode is expected to ask of the heads, per member."""
+
+    ratio: Float[Array, " member"]
+    """Prior variance of a weight over the variance of the noise (ρ)."""
+    noise: Float[Array, "member obs"]
+    """Variance of the noise in normalised units (σ²)."""
+    log_reference: Float[Array, " member"]
+    """Log-variance that the heads claim on average; relative noise n is measured against it."""
+
+
+class Seen(NamedTuple):
+    """Transitions as the heads see them, before anything is learned from them."""
+
+    features: Float[Array, "env member feature"]
+    """The backbone's output, the context and a 1."""
+    residual: Float[Array, "env member head obs"]
+    """The normalised delta minus each head's mean."""
+    logvar: Float[Array, "env member head obs"] | None
+    """The heads' own log-variance; None if they are deterministic."""
+
+    @classmethod
+    def through(
+        cls,
+        model: MultiHeadDynamics,
+        task: Task,
+        statistics: Statistics,
+        transition: tuple[Float[Array, "env obs"], Float[Array, "env action"], Array],
+        context: Float[Array, "member env context"] | None,
+    ) -> "Seen":
+        """Look at one transition per environment through a model.
+
+        Args:
+            model: The dynamics model.
+            task: How observations enter and leave it.
+            statistics: The normalisers in use.
+            transition: Observations, actions in [-1, 1], next observations.
+            context: The context vectors that the heads plan with.
+        """
+        obs, action, next_obs = transition
+        net = model.forward_net
+        x = network_input(task, statistics, obs, action)
+        wide = jnp.broadcast_to(x, (model.num_members, *x.shape))
+        head_input = net.head_input(wide, context)
+        target = statistics.delta.normalize(task.target(obs, next_obs))
+        mean, logvar = net.predict(head_input)
+        if logvar is not None:
+            logvar = logvar.transpose(2, 0, 1, 3)
+        one = jnp.ones((*head_input.shape[:-1], 1))
+        features = jnp.concatenate([head_input, one], axis=-1).transpose(1, 0, 2)
+        residual = target - mean
+        return cls(features, residual.transpose(2, 0, 1, 3), logvar)
+
+
+class Observed(NamedTuple):
+    """What the heads learn from: the newest transition of each environment."""
+
+    features: Float[Array, "env member feature"]
+    residual: Float[Array, "env member head obs"]
+    noise: Float[Array, "env member group"]
+    """Relative variance n of the noise: one for all heads, or one for each."""
+
+    @classmethod
+    def of(
+        cls,
+        seen: Seen,
+        happened: Bool[Array, " env"],
+        log_reference: Float[Array, " member"] | None = None,
+    ) -> "Observed":
+        """Keep what happened and can be true.
+
+        The rest gets features of zero, from which nothing is learned.
+
+        Args:
+            seen: The transitions.
+            happened: Where there was one.
+            log_reference: Given if the noise follows the heads' own variance; `Prior` has it.
+        """
+        size = jnp.square(seen.features).sum(-1)
+        true = happened[:, None] & (size < MAX_FEATURES)
+        true &= (jnp.abs(seen.residual) < BELIEVABLE).all((-2, -1))
+        noise = jnp.ones((*size.shape, 1))
+        if seen.logvar is not None and log_reference is not None:
+            relative = seen.logvar.mean(-1) - log_reference[:, None]
+            noise = jnp.exp(jnp.clip(relative, -MAX_LOG_NOISE, MAX_LOG_NOISE))
+        return cls(
+            jnp.where(true[..., None], seen.features, 0.0),
+            jnp.where(true[..., None, None], seen.residual, 0.0),
+            jnp.where(true[..., None], noise, 1.0),
+        )
+
+
+class LastLayer(NamedTuple):
+    """What the heads have learned in each environment's episode."""
+
+    weight: Float[Array, "env member head feature obs"]
+    """Posterior mean of the correction, in normalised units; the last feature is 1."""
+    root: Float[Array, "env member group feature feature"]
+    """Square root S of the posterior covariance in units of the noise variance, P = S Sᵀ."""
+
+    @classmethod
+    def of_prior(
+        cls, prior: Prior, num_envs: int, sizes: tuple[int, int, int], *, groups: int = 1
+    ) -> "LastLayer":
+        """Nothing learned yet.
+
+        Args:
+            prior: Where every episode starts.
+            num_envs: How many environments.
+            sizes: Heads, features (with the 1), and dimensions of an observation.
+            groups: 1 if all heads share their noise, else the number of heads.
+        """
+        heads, features, obs_size = sizes
+        members = prior.ratio.shape[0]
+        start = jnp.sqrt(prior.ratio)[:, None, None, None] * jnp.eye(features)
+        return cls(
+            jnp.zeros((num_envs, members, heads, features, obs_size)),
+            jnp.broadcast_to(start, (num_envs, members, groups, features, features)),
+        )
+
+    def correction(self) -> DenseHeads:
+        """What is added to the mean heads, which see the features without the 1."""
+        return DenseHeads(self.weight[..., :-1, :], self.weight[..., -1, :])
+
+
+class Forecast(NamedTuple):
+    """What was expected of a transition before it was learned from."""
+
+    innovation: Float[Array, "env member head obs"]
+    """The residual minus what the correction foresaw."""
+    projected: Float[Array, "env member group feature"]
+    """Sᵀφ, whose squared norm is the variance that stems from the weights."""
+    spread: Float[Array, "env member group"]
+    """Predictive variance over the noise variance, n + φᵀPφ."""
+
+
+def forecast(state: LastLayer, seen: Observed) -> Forecast:
+    """Predict a transition with what was learned so far."""
+    foreseen = jnp.einsum("emi,emhio->emho", seen.features, state.weight)
+    projected = jnp.einsum("emgij,emi->emgj", state.root, seen.features)
+    spread = seen.noise + jnp.square(projected).sum(-1)
+    return Forecast(seen.residual - foreseen, projected, spread)
+
+
+def update(state: LastLayer, seen: Observed) -> LastLayer:
+    """Learn from one transition per environment (Potter's square-root filter).
+
+    S loses a part of rank one, so the covariance can neither grow nor turn negative, however
+    many transitions there are.
+    """
+    innovation, projected, spread = forecast(state, seen)
+    gain = jnp.einsum("emgij,emgj->emgi", state.root, projected) / spread[..., None]
+    weight = state.weight + gain[..., :, None] * innovation[..., None, :]
+    share = 1.0 / (1.0 + jnp.sqrt(seen.noise / spread))
+    lost = share[..., None, None] * gain[..., :, None] * projected[..., None, :]
+    return LastLayer(weight, state.root - lost)
+
+
+def forget(state: LastLayer, prior: Prior, share: float) -> LastLayer:
+    """Let the weights drift back towards the prior, as time passes.
+
+    Args:
+        state: What was learned.
+        prior: Where the weights drift.
+        share: Share of the covariance that is the prior's again after one step; above 0.
+    """
+    ratio = prior.ratio[:, None, None, None]
+    covariance = state.root @ state.root.mT / jnp.maximum(ratio, TINY)
+    mixed = (1.0 - share) * covariance + share * jnp.eye(state.root.shape[-1])
+    root = jnp.sqrt(ratio) * jnp.linalg.cholesky(mixed)
+    return LastLayer((1.0 - share) ** 0.5 * state.weight, root)
+
+
+def log_likelihood(
+    expected: Forecast, noise: Float[Array, "member obs"]
+) -> Float[Array, "env member head"]:
+    """Log-density of the transition under each head's forecast, summed over dimensions."""
+    var = jnp.maximum(expected.spread[..., None] * noise[:, None, :], TINY)
+    terms = jnp.square(expected.innovation) / var + jnp.log(2.0 * jnp.pi * var)
+    return -0.5 * terms.sum(-1)

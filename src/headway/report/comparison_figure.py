@@ -1,0 +1,124 @@
+"""The figure of an experiment: a panel per environment, a curve or a line of dots per arm."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+
+from headway.report.comparison import COLLECTED, Found, Point
+from headway.report.style import FAINT, HEADS, INK, figure, label_axis, legend
+
+COLUMNS = 3
+_STYLES = ("-", "--", ":")
+
+
+def draw_comparison(found: Found) -> list[Path]:
+    """Draw returns over environment steps, or the last ones where only these were measured.
+
+    Returns:
+        The PNG and the SVG file; nothing where no run is finished.
+    """
+    comparison = found.comparison
+    envs = [env for env in comparison.envs if any(point.env == env for point in found.points)]
+    if not envs:
+        return []
+    path = comparison.folder / f"{comparison.experiment.name}.png"
+    curves = has_curves(found)
+    columns = min(len(envs), COLUMNS)
+    lines = -(-len(envs) // columns)
+    height = 2.6 if curves else 0.9 + 0.32 * len(comparison.experiment.arms)
+    size = (max(3.6 * columns, 6.8), height * lines + 1.4)
+    title = f"{comparison.experiment.name}: {comparison.experiment.title}"
+    with figure(path, title=title, caption=_caption(found, curves), size=size, svg=True) as drawing:
+        panels = drawing.subplots(lines, columns, squeeze=False, sharey=not curves)
+        for axes in panels.flat[len(envs) :]:
+            axes.set_visible(False)
+        for axes, env in zip(panels.flat, envs, strict=False):
+            (_curves if curves else _dots)(axes, found, env)
+            axes.set_title(env)
+        legend(drawing, _handles(found))
+    return [path, path.with_suffix(".svg")]
+
+
+def has_curves(found: Found) -> bool:
+    """Whether some run was measured after several iterations."""
+    return len({point.iteration for point in found.points}) > 1
+
+
+def arm_styles(labels: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """A colour and a line style per arm; colours repeat with another style."""
+    return {
+        label: (HEADS[i % len(HEADS)], _STYLES[i // len(HEADS) % len(_STYLES)])
+        for i, label in enumerate(labels)
+    }
+
+
+def _labels(found: Found) -> list[str]:
+    return [arm.label for arm in found.comparison.experiment.arms]
+
+
+def _handles(found: Found) -> list[Line2D]:
+    styles = arm_styles(_labels(found))
+    return [
+        Line2D([], [], color=color, linestyle=line, marker="o", markersize=4, label=label)
+        for label, (color, line) in styles.items()
+    ]
+
+
+def _curves(axes: Axes, found: Found, env: str) -> None:
+    """Mean over seeds, with a band of one standard deviation where there are several."""
+    for label, (color, line) in arm_styles(_labels(found)).items():
+        points = found.of(env, label)
+        steps = sorted({point.timesteps for point in points})
+        by_step = [[p.value for p in points if p.timesteps == step] for step in steps]
+        mean = np.array([np.mean(values) for values in by_step])
+        if any(len(values) > 1 for values in by_step):
+            std = np.array([np.std(values, ddof=len(values) > 1) for values in by_step])
+            axes.fill_between(steps, mean - std, mean + std, color=color, alpha=0.13, linewidth=0)
+        axes.plot(steps, mean, color=color, linestyle=line, marker="o", markersize=3)
+    axes.set_xlim(left=0)
+    axes.xaxis.set_major_locator(MaxNLocator(4))
+    axes.xaxis.set_major_formatter("{x:,.0f}")
+    axes.yaxis.set_major_formatter("{x:,.6g}")
+    label_axis(axes, "environment steps collected", "return per episode")
+
+
+def _dots(axes: Axes, found: Found, env: str) -> None:
+    """A line per arm: a dot per seed, a bar at their mean."""
+    labels = _labels(found)
+    for row, (label, (color, _)) in enumerate(arm_styles(labels).items()):
+        points: list[Point] = found.last(env, label)
+        values = [point.value for point in points]
+        if not values:
+            axes.text(
+                0.5, row, "no run", va="center", color=FAINT, transform=axes.get_yaxis_transform()
+            )
+            continue
+        axes.plot(values, [row] * len(values), "o", color=color, alpha=0.6, markersize=5)
+        axes.plot([np.mean(values)] * 2, [row - 0.3, row + 0.3], color=INK, linewidth=1.6)
+    axes.set_yticks(range(len(labels)), labels)
+    axes.set_ylim(len(labels) - 0.5, -0.5)
+    axes.tick_params(axis="y", length=0)
+    axes.grid(visible=False, axis="y")
+    axes.grid(visible=True, axis="x")
+    axes.xaxis.set_major_locator(MaxNLocator(4))
+    axes.xaxis.set_major_formatter("{x:,.6g}")
+    axes.set_xlabel("return per episode")
+
+
+def _caption(found: Found, curves: bool) -> str:
+    comparison = found.comparison
+    what = "unseen physics"
+    if comparison.experiment.measure == COLLECTED:
+        what = "the episodes collected for training, the first iteration at random"
+    marks = (
+        "Lines are means over seeds, bands ± 1 standard deviation."
+        if curves
+        else "Dots are seeds after the last iteration, bars their mean."
+    )
+    seeds = ", ".join(map(str, comparison.seeds))
+    missing = f" {len(found.missing)} runs are not finished." if found.missing else ""
+    return f"Return on {what}; preset {comparison.preset}, seeds {seeds}. {marks}{missing}"

@@ -1,0 +1,1 @@
+"""One page that compares runs: methods against environments, over seeds."""

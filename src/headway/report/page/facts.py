@@ -1,0 +1,138 @@
+"""The chapters of the page that say how its numbers came about."""
+
+import shlex
+
+import numpy as np
+
+from headway.experiment.storage import csv_lines
+from headway.report.page import charts, svg
+from headway.report.page.measures import RAW_COLUMNS, raw_rows
+from headway.report.page.parts import Block, Cell, Line, Panel, Section, Table, identifier
+from headway.report.page.runs import LoadedRun, train_command
+from headway.report.page.series import (
+    Comparison,
+    differing_settings,
+    run_settings,
+    value_text,
+)
+
+PHASES = ("collect", "fit", "evaluate")
+_TEXTS = ("env", "method", "group", "sim_params")
+
+
+def settings(comparison: Comparison) -> Section:
+    """The settings in which the runs of an environment differ."""
+    lead = (
+        "Settings that are not the same in all runs of an environment, seeds aside. Everything else"
+        " is equal."
+    )
+    blocks = [_settings_of(comparison, env) for env in comparison.envs]
+    return Section("settings", "Settings that differ", lead, blocks)
+
+
+def _settings_of(comparison: Comparison, env: str) -> Block:
+    series = comparison.series_of(env)
+    tables = [run_settings(comparison.runs_of(env, one)[0]) for one in series]
+    names = [name for name in differing_settings(tables) if name not in ("method", "seed")]
+    if not names:
+        return Block(env, texts=["All runs have the same settings."])
+    lines = [
+        Line([Cell(name, is_code=True), *(Cell(value_text(table.get(name))) for table in tables)])
+        for name in names
+    ]
+    return Block(env, table=Table(["setting", *(one.label for one in series)], lines))
+
+
+def times(comparison: Comparison) -> Section:
+    """How long runs took."""
+    blocks = []
+    for env in comparison.envs:
+        bars, lines = [], []
+        for series in comparison.series_of(env):
+            runs = [run for run in comparison.runs_of(env, series) if run.is_finished]
+            if not runs:
+                continue
+            taken = [run_minutes(run) for run in runs]
+            minutes = {phase: np.mean([one[phase] for one in taken]) for phase in PHASES}
+            bars.append((series, minutes))
+            cells = [_minutes(minutes[phase]) for phase in PHASES]
+            cells.append(_minutes(sum(minutes.values())))
+            devices = ", ".join(sorted({run.device for run in runs}))
+            named = Cell(series.label, is_key=True)
+            lines.append(Line([named, *cells, Cell(devices)], series.index))
+        if not bars:
+            blocks.append(Block(env, texts=["No run is finished yet."]))
+            continue
+        drawn = svg.panel(
+            lambda axes, bars=bars: charts.run_times(axes, bars),
+            name=identifier("times", env),
+            label=f"Minutes per run of each method on {env}",
+            size=(3.5, 0.72 + 0.24 * len(bars)),
+        )
+        columns = ["method", *(f"{phase}, min" for phase in PHASES), "all, min", "device"]
+        blocks.append(Block(env, [Panel("", drawn)], Table(columns, lines)))
+    lead = (
+        "Minutes per finished run, mean over seeds. They are comparable only where the runs had the"
+        " machine to themselves."
+    )
+    return Section("times", "Run times", lead, blocks)
+
+
+def run_minutes(run: LoadedRun) -> dict[str, float]:
+    """Minutes of each phase over all iterations."""
+    return {
+        phase: sum(row.get("seconds", {}).get(phase, 0.0) for row in run.metrics) / 60
+        for phase in PHASES
+    }
+
+
+def _minutes(value: float) -> Cell:
+    return Cell(f"{value:,.1f}", is_number=True)
+
+
+def sources(comparison: Comparison) -> Section:
+    """The runs, and the command that makes each."""
+    lines = []
+    for env in comparison.envs:
+        for series in comparison.series_of(env):
+            for run in comparison.runs_of(env, series):
+                done = f"{len(run.metrics)} of {run.config.collection.num_iterations}"
+                command = shlex.join(train_command(run))
+                cells = [
+                    Cell(str(run.path), command, is_code=True),
+                    Cell(series.label, is_key=True),
+                    Cell(str(run.config.seed), is_number=True),
+                    Cell(done, is_number=True),
+                ]
+                lines.append(Line(cells, series.index))
+    table = Table(["run, and the command that makes it", "method", "seed", "iterations"], lines)
+    return Section(
+        "runs",
+        "Runs",
+        "Every run on this page. The command resumes a run that was interrupted.",
+        [Block(table=table)],
+    )
+
+
+def numbers(comparison: Comparison) -> Section:
+    """The raw numbers, to look at and to copy."""
+    rows = raw_rows(comparison)
+    index = {series.label: series.index for series in comparison.series}
+    shown = RAW_COLUMNS[:-1]
+    lines = [
+        Line([_raw_cell(name, row[name]) for name in shown], index[row["method"]]) for row in rows
+    ]
+    lead = (
+        "Each finished run's test episodes for every physics: mean and standard deviation over"
+        " episodes."
+    )
+    blocks = [Block(table=Table([name.replace("_", " ") for name in shown], lines))]
+    csv = csv_lines(RAW_COLUMNS, rows, header=True)
+    if not rows:
+        blocks, csv = [Block(texts=["No run is finished yet."])], ""
+    return Section("numbers", "Raw numbers", lead, blocks, csv=csv)
+
+
+def _raw_cell(column: str, value: object) -> Cell:
+    text = value_text(value)
+    return Cell(text, is_number=column not in _TEXTS, is_key=column == "method")

@@ -1,0 +1,227 @@
+"""The chapters of the page that show how well methods do."""
+
+from headway.report import statistics
+from headway.report.page import charts, svg
+from headway.report.page.measures import (
+    aggregate,
+    curve,
+    curve_groups,
+    groups,
+    has_scores,
+    improvement,
+    outcomes,
+    values,
+)
+from headway.report.page.parts import Block, Cell, Line, Panel, Section, Table, identifier
+from headway.report.page.scoring import REFERENCES
+from headway.report.page.series import Comparison, Series
+from headway.report.statistics import Estimate
+from headway.report.style import group_label
+
+
+def results(comparison: Comparison) -> Section:
+    """Tables of the final results."""
+    lead = (
+        "After the last iteration. Scores are 0 for random actions and 1 for the same planner on"
+        " the true dynamics; they are interquartile means over seeds with 95 % bootstrap intervals."
+        " Returns are means ± standard deviations over seeds. Every physics of a group counts once."
+    )
+    blocks = [_all_environments(comparison)] if len(comparison.envs) > 1 else []
+    blocks += [_results_of(comparison, env) for env in comparison.envs]
+    blocks = [block for block in blocks if block is not None]
+    return Section("results", "Results", lead, [*blocks, _seeds(comparison)])
+
+
+def _all_environments(comparison: Comparison) -> Block | None:
+    lines = []
+    for series in comparison.series:
+        found = aggregate(comparison, series)
+        if found is not None:
+            cells = [_count(found.num_runs), Cell(*_value(found, "{:.2f}"), is_number=True)]
+            lines.append(Line([Cell(series.label, is_key=True), *cells], series.index))
+    if not lines:
+        return None
+    table = Table(["method", "seeds", "score on unseen physics"], lines)
+    return Block("All environments", table=table)
+
+
+def _results_of(comparison: Comparison, env: str) -> Block:
+    tested = groups(comparison, env)
+    lines = []
+    for series in comparison.series_of(env):
+        cells = [_result(comparison, env, series, group) for group in tested]
+        seeds = len([run for run in comparison.runs_of(env, series) if run.tests])
+        named = Cell(series.label, is_key=True)
+        lines.append(Line([named, _count(seeds), *cells], series.index))
+    columns = ["method", "seeds", *map(group_label, tested)]
+    if not tested:
+        return Block(env, texts=["No run is finished yet."])
+    texts = []
+    if has_scores(comparison, env):
+        texts.append(f"Scores are {comparison.references.describe(env)}.")
+    else:
+        texts.append("Returns: no references are known for all of these physics.")
+    return Block(env, table=Table(columns, lines), texts=texts)
+
+
+def _result(comparison: Comparison, env: str, series: Series, group: str) -> Cell:
+    found = outcomes(comparison, env, series, group)
+    if not found:
+        return Cell("–", is_number=True)
+    with_score = has_scores(comparison, env)
+    main = statistics.estimate([values(comparison, env, series, group)])
+    text, interval = _value(main, "{:.2f}" if with_score else "{:,.1f}")
+    if not with_score:
+        return Cell(text, interval, is_number=True)
+    returns = [one.episode_return for one in found]
+    spread = statistics.standard_deviation([returns])
+    below = f"return {_number(float(statistics.mean([returns])), '{:,.0f}')}"
+    below += "" if spread is None else f" ± {spread:,.0f}"
+    return Cell(f"{text} ({interval})" if interval else text, below, is_number=True)
+
+
+def _value(found: Estimate, form: str) -> tuple[str, str]:
+    """A value and its interval, as texts."""
+    ends = " to ".join(_number(end, form) for end in found.interval or ())
+    return _number(found.value, form), ends
+
+
+def _number(value: float, form: str) -> str:
+    return form.format(value).replace("-", "−")
+
+
+def _count(number: int) -> Cell:
+    return Cell(str(number), is_number=True)
+
+
+def _seeds(comparison: Comparison) -> Block:
+    """What the number of seeds allows to say."""
+    counts = {
+        (env, series.label): len([r for r in comparison.runs_of(env, series) if r.tests])
+        for env in comparison.envs
+        for series in comparison.series_of(env)
+    }
+    few = [place for place, number in counts.items() if number < statistics.MIN_RUNS]
+    texts = []
+    if few:
+        names = "; ".join(f"{label} on {env} ({counts[env, label]})" for env, label in few)
+        texts.append(
+            f"Fewer than {statistics.MIN_RUNS} finished seeds: {names}. No interval is given for"
+            " them, and no difference is claimed."
+        )
+    texts.append(statistics.caution(min(counts.values())).strip())
+    return Block(texts=[text for text in texts if text])
+
+
+def learning(comparison: Comparison) -> Section:
+    """Learning curves: while collecting, and of each tested group."""
+    blocks = []
+    for env in comparison.envs:
+        panels, once = [], []
+        for group in curve_groups(comparison, env):
+            panel = _curves(comparison, env, group)
+            panels += [panel] if panel else []
+            once += [] if panel else [charts.group_title(group)]
+        texts = [f"Measured after one iteration at most, so no curve: {'; '.join(once)}."]
+        blocks.append(Block(env, panels, texts=texts if once else []))
+    lead = (
+        "Lines are means over seeds. Bands are 95 % bootstrap intervals of the mean; with fewer"
+        " than three seeds each seed has a thin line instead. Dotted thin lines are unfinished"
+        " runs. The first iteration acts at random."
+    )
+    return Section("learning-curves", "Learning curves", lead, blocks)
+
+
+def _curves(comparison: Comparison, env: str, group: str) -> Panel | None:
+    found = [
+        (series, measured)
+        for series in comparison.series_of(env)
+        if (measured := curve(comparison.runs_of(env, series), group)) is not None
+    ]
+    if not any(len(measured.steps) > 1 for _, measured in found):
+        return None
+    rows = [row for run in comparison.runs_of(env) for row in run.tests if row.group == group]
+    known = {name: comparison.references.level(name, rows) for name in REFERENCES}
+    levels = {name: level for name, level in known.items() if level is not None}
+    title = charts.group_title(group)
+    drawn = svg.panel(
+        lambda axes: charts.learning_curves(axes, found, levels),
+        name=identifier("learning", env, group),
+        label=f"Return over environment steps on {env}, {title}",
+    )
+    return Panel(title, drawn)
+
+
+def group_bars(comparison: Comparison) -> Section:
+    """A bar per method for each group."""
+    blocks = []
+    for env in comparison.envs:
+        panels = [
+            panel
+            for group in groups(comparison, env)
+            if (panel := _bars(comparison, env, group)) is not None
+        ]
+        texts = [] if panels else ["No run is finished yet."]
+        blocks.append(Block(env, panels, texts=texts))
+    lead = (
+        "Bars are means over seeds after the last iteration, dots single seeds, lines 95 %"
+        " bootstrap intervals of the mean where there are three seeds or more."
+    )
+    return Section("groups", "Training and unseen physics", lead, blocks)
+
+
+def _bars(comparison: Comparison, env: str, group: str) -> Panel | None:
+    found = [
+        (series, measured)
+        for series in comparison.series_of(env)
+        if (measured := values(comparison, env, series, group))
+    ]
+    if not found:
+        return None
+    with_score = has_scores(comparison, env)
+    levels = {"true dynamics": 1.0} if with_score else None
+    label = "score" if with_score else "return per episode"
+    title = group_label(group)
+    drawn = svg.panel(
+        lambda axes: charts.group_bars(axes, found, label, levels),
+        name=identifier("bars", env, group),
+        label=f"{label} of each method on {env}, {title}",
+        size=(3.5, 2.5 if len(found) <= 4 else 2.9),
+    )
+    return Panel(title, drawn)
+
+
+def improvements(comparison: Comparison) -> Section:
+    """How likely one method beats another."""
+    lead = (
+        "Probability that a run of the method in the row beats a run of the method in the column on"
+        " unseen physics, averaged over the environments and groups that both were tested on; 0.5"
+        " means no difference. Below it the 95 % bootstrap interval."
+    )
+    series = comparison.series
+    if len(series) < 2:
+        blocks = [Block(texts=["There is one method only: nothing to compare."])]
+        return Section("improvement", "Probability of improvement", lead, blocks)
+    lines = []
+    for first in series:
+        cells = [_improvement(comparison, first, second) for second in series]
+        lines.append(Line([Cell(first.label, is_key=True), *cells], first.index))
+    table = Table(["", *(one.label for one in series)], lines)
+    first, *others = series
+    texts = []
+    if all(improvement(comparison, first, other) is None for other in others):
+        table, texts = None, ["No two methods were tested on the same unseen physics."]
+    for other in others:
+        found = improvement(comparison, first, other)
+        if found is not None:
+            texts.append(statistics.verdict(first.label, other.label, found))
+    return Section(
+        "improvement", "Probability of improvement", lead, [Block(table=table, texts=texts)]
+    )
+
+
+def _improvement(comparison: Comparison, first: Series, second: Series) -> Cell:
+    found = None if first == second else improvement(comparison, first, second)
+    if found is None:
+        return Cell("–", is_number=True)
+    return Cell(*_value(found, "{:.2f}"), is_number=True)

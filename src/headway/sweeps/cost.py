@@ -1,0 +1,112 @@
+"""What runs will take, before they are made: arithmetic from settings, speed from finished runs."""
+
+import dataclasses
+import time
+from collections.abc import Sequence
+
+import numpy as np
+
+from headway.config import Config
+from headway.experiment.limits import num_parameters
+from headway.experiment.runs import RunDir
+from headway.experiment.training import load_task
+from headway.planning.flop import plan_flop
+from headway.sweeps.board import first_status
+from headway.sweeps.jobs import Job
+from headway.sweeps.status import State
+from headway.tasks.catalog import env_spec
+
+PER_PRODUCT = 3.0  # a run takes about so much longer than its matrix products alone
+_SIZE, _PRODUCTS = 768, 12  # matrices that are multiplied to time this machine
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannedJob:
+    """What is to be done for one run."""
+
+    job: Job
+    state: State
+    """`done`, `waiting`, or `failed` where its directory cannot be used."""
+    finished_iterations: int
+    flop: float
+    """Operations of the matrix products that are still to come."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """What is to be done for a comparison."""
+
+    jobs: list[PlannedJob]
+    flop_per_second: float
+    """Speed of one run at a time on this machine."""
+    source: str
+    """Where the speed comes from."""
+
+    def seconds(self, jobs: Sequence[PlannedJob] | None = None) -> float:
+        """Time for some jobs, one after another; for all of them by default."""
+        return sum(job.flop for job in (self.jobs if jobs is None else jobs)) / self.flop_per_second
+
+
+def make_plan(jobs: Sequence[Job]) -> Plan:
+    """List what is missing and estimate what it takes; nothing is run.
+
+    Args:
+        jobs: Every run of a comparison. Those finished already give the speed.
+    """
+    planned = [_planned(job) for job in jobs]
+    speeds = [_measured_speed(one.job) for one in planned if one.state == "done"]
+    if speeds:
+        return Plan(planned, float(np.median(speeds)), f"{len(speeds)} finished runs")
+    return Plan(planned, _matrix_rate() / PER_PRODUCT, "matrix products timed just now")
+
+
+def run_flop(config: Config, first_iteration: int = 0) -> float:
+    """Operations of the matrix products of a run, from some iteration on.
+
+    Planning and the updates of the networks are counted: together nearly all of the time at
+    the sizes of the presets `quick` and `paper`.
+
+    Args:
+        config: All settings.
+        first_iteration: Iterations before this one are done already.
+    """
+    task, spec = load_task(config), env_spec(config.env)
+    length = config.collection.episode_length or spec.episode_length
+    per_step = plan_flop(config.model, config.planner, task)
+    per_sample = 6.0 * num_parameters(config, task)  # forwards, and backwards twice as much
+    num_unseen = len((config.sim_params or spec.sim_params).group_names) - 1
+    total = 0.0
+    for iteration in range(first_iteration, config.collection.num_iterations):
+        collected = config.collection.num_episodes * length
+        steps = collected if iteration else 0  # the first collection acts at random
+        groups = num_unseen if (iteration + 1) % config.evaluation.every == 0 else 0
+        if iteration == config.collection.num_iterations - 1:
+            groups = num_unseen + 1
+        steps += groups * config.evaluation.num_episodes * length
+        passes = config.fitting.epochs * (iteration + 1) * collected
+        total += steps * per_step + passes * config.fitting.future_length * per_sample
+    return total
+
+
+def _planned(job: Job) -> PlannedJob:
+    status = first_status(job)
+    left = run_flop(job.config, status.iteration) if status.state == "waiting" else 0.0
+    return PlannedJob(job, status.state, status.iteration, left)
+
+
+def _measured_speed(job: Job) -> float:
+    """Operations per second of a finished run, with all that it did beside products."""
+    seconds = sum(sum(line["seconds"].values()) for line in RunDir(job.path).metrics())
+    return run_flop(job.config) / max(seconds, 1e-3)
+
+
+def _matrix_rate() -> float:
+    """Operations per second of this machine's matrix products in float32."""
+    matrix = np.ones((_SIZE, _SIZE), np.float32)
+    matrix @ matrix  # the first one starts threads
+    fastest = float("inf")
+    for _ in range(_PRODUCTS):
+        begin = time.perf_counter()
+        matrix @ matrix
+        fastest = min(fastest, time.perf_counter() - begin)
+    return 2 * _SIZE**3 / fastest

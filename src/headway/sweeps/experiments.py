@@ -1,0 +1,187 @@
+"""The comparisons of the paper as one table: named experiments, each a list of arms.
+
+An arm is a method with some settings, trained and tested with them: where an arm changes the
+planner, it also collects its data with that planner, as the released code does. Values that the
+supplement does not give (Figs. 14 to 16) are the project's. Arms with the same settings in two
+experiments share their runs.
+"""
+
+import dataclasses
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+from headway.errors import ConfigError, shown, unknown_name
+from headway.experiment.methods import METHODS
+
+Settings = Mapping[str, Any]
+Measure = Literal["unseen", "collected"]
+
+NUM_HEADS = (1, 2, 3, 5, 8)
+SEGMENT_LENGTHS = (1, 5, 10, 20, 50)
+SELECTION_LENGTHS = (1, 5, 10, 20, 50)
+
+
+@dataclasses.dataclass(frozen=True)
+class Arm:
+    """One of the things that an experiment compares."""
+
+    label: str
+    """As it stands in figures and tables."""
+    method: str = "tmcl"
+    """A name of the table of methods."""
+    settings: Settings = dataclasses.field(default_factory=dict)
+    """What differs from the method, by dotted name."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """A comparison: arms that are run in the same environments with the same seeds."""
+
+    name: str
+    """As the command line takes it."""
+    title: str
+    """What is compared."""
+    arms: tuple[Arm, ...]
+    """What is compared, in the order of the figure."""
+    measure: Measure = "unseen"
+    """Returns on unseen physics, or those of the episodes collected for training."""
+
+
+_CONTEXT_OFF: Settings = {"model.context_size": 0, "model.backward_net": False}
+_TMCL = Arm("T-MCL")
+_MCL = Arm("MCL", "mcl")
+_LABELS = {
+    "tmcl": "T-MCL",
+    "mcl": "MCL",
+    "pets": "PETS",
+    "mh-pets": "Multi-Headed PETS",
+    "vanilla": "Vanilla",
+}
+
+
+def _selection(label: str, head_selection: str) -> Arm:
+    return Arm(label, settings={"planner.head_selection": head_selection})
+
+
+def _segments(length: int) -> Arm:
+    # Heads that compete for segments of one transition are MCL, so these share their runs.
+    if length == 1:
+        return dataclasses.replace(_MCL, label="M = 1")
+    return Arm(f"M = {length}", settings={"fitting.segment_length": length})
+
+
+def _past(length: int) -> Arm:
+    chosen: dict[str, Any] = {"planner.selection_length": length}
+    if length == 1:  # the preset `released-code` would skip this only transition
+        chosen["planner.selection_skips_newest"] = False
+    return Arm(f"N = {length}", settings=chosen)
+
+
+def _all_methods() -> tuple[Arm, ...]:
+    return tuple(Arm(_LABELS.get(name, name), name) for name in METHODS)
+
+
+_EXPERIMENTS = (
+    Experiment("comparison", "every method on unseen physics", _all_methods()),
+    Experiment("fig9", "every method while learning", _all_methods(), measure="collected"),
+    Experiment(
+        "fig10",
+        "PETS with one head and with several",
+        (Arm("PETS", "pets"), Arm("Multi-Headed PETS", "mh-pets")),
+    ),
+    Experiment(
+        "fig11",
+        "adaptive and non-adaptive planning",
+        (_selection("adaptive", "adaptive"), _selection("non-adaptive (average)", "average")),
+    ),
+    Experiment(
+        "fig12",
+        "with and without context learning",
+        (Arm("with context"), Arm("without context", settings=_CONTEXT_OFF)),
+    ),
+    Experiment("fig13", "MCL and T-MCL", (_MCL, _TMCL)),
+    Experiment(
+        "fig14",
+        "number of prediction heads H",
+        tuple(Arm(f"H = {heads}", settings={"model.num_heads": heads}) for heads in NUM_HEADS),
+    ),
+    Experiment(
+        "fig15",
+        "segment length M of the oracle loss",
+        tuple(_segments(length) for length in SEGMENT_LENGTHS),
+    ),
+    Experiment(
+        "fig16",
+        "past transitions N that select a head",
+        tuple(_past(length) for length in SELECTION_LENGTHS),
+    ),
+    Experiment(
+        "heads",
+        "T-MCL with heads and without",
+        (Arm("three heads"), Arm("one head", settings={"model.num_heads": 1})),
+    ),
+    Experiment(
+        "selection",
+        "which head plans",
+        (
+            _selection("adaptive", "adaptive"),
+            _selection("average", "average"),
+            _selection("random", "random"),
+        ),
+    ),
+    Experiment(
+        "oracle",
+        "what a head wins: trajectory segments, transitions, nothing",
+        (
+            Arm("trajectory-wise"),
+            dataclasses.replace(_MCL, label="transition-wise"),
+            Arm("independent", settings={"fitting.oracle": "independent"}),
+        ),
+    ),
+)
+
+EXPERIMENTS: dict[str, Experiment] = {experiment.name: experiment for experiment in _EXPERIMENTS}
+
+
+def experiment(name: str) -> Experiment:
+    """Look an experiment up.
+
+    Raises:
+        UnknownNameError: No such experiment.
+    """
+    if name not in EXPERIMENTS:
+        raise unknown_name("experiment", name, EXPERIMENTS)
+    return EXPERIMENTS[name]
+
+
+def sweep_experiment(
+    name: str, methods: Sequence[str], grid: Mapping[str, Sequence[Any]]
+) -> Experiment:
+    """An experiment of one's own: every method with every combination of some settings.
+
+    Args:
+        name: Names the folder of its results.
+        methods: Names of the table of methods.
+        grid: Values of settings by dotted name.
+
+    Raises:
+        ConfigError: The name is no plain name, or something is asked for twice.
+    """
+    if not re.fullmatch(r"[\w-]{1,60}", name) or name in EXPERIMENTS:
+        raise ConfigError(
+            f"the sweep's name is {shown(name)}, allowed: letters, digits, - and _, and none of"
+            f" {', '.join(EXPERIMENTS)}."
+        )
+    arms = []
+    for method in methods:
+        for values in itertools.product(*grid.values()):
+            chosen = dict(zip(grid, values, strict=True))
+            parts = [_LABELS.get(method, method), *(f"{n} {v}" for n, v in chosen.items())]
+            arms.append(Arm(", ".join(parts), method, chosen))
+    labels = [arm.label for arm in arms]
+    if not labels or len(set(labels)) < len(labels):
+        raise ConfigError("a sweep names a method or a value twice, or none; allowed: each once.")
+    title = " and ".join(["methods", *grid])
+    return Experiment(name, title, tuple(arms))

@@ -1,0 +1,153 @@
+"""What an experiment needs: one run per arm, environment and seed, each with its directory.
+
+A run's directory is named by its whole configuration, so that whoever needs the same run finds
+it, and two different ones never meet.
+"""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from headway import settings
+from headway.config import Config
+from headway.errors import ConfigError, RunError
+from headway.experiment.methods import make_config
+from headway.experiment.runs import RunDir
+from headway.sweeps.experiments import Arm, Experiment, Settings
+from headway.tasks.catalog import env_spec
+
+
+class Cell(NamedTuple):
+    """A place in the table of an experiment."""
+
+    env: str
+    arm: str
+    seed: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """A run to be made: its settings, and the directory that is its alone."""
+
+    config: Config
+    path: Path
+
+    @classmethod
+    def of(cls, config: Config, out: Path) -> "Job":
+        """The job of a configuration, under the directory of all results."""
+        named = f"{config.method}-{config.preset}-{fingerprint(config)}"
+        return cls(config, out / "runs" / config.env / named / f"seed{config.seed}")
+
+    @property
+    def num_iterations(self) -> int:
+        """Iterations of the whole run."""
+        return self.config.collection.num_iterations
+
+    @property
+    def finished_iterations(self) -> int:
+        """Iterations that are complete already.
+
+        Raises:
+            RunError: The directory holds a run with other settings, or a damaged one.
+        """
+        if not (self.path / "config.json").exists():
+            return 0
+        run = RunDir(self.path)
+        found = settings.differences(run.config(), self.config)
+        if found:
+            raise RunError(
+                f"{self.path} holds a run with other settings ({'; '.join(found)}), perhaps of an"
+                " older version; choose another --out, or move it away."
+            )
+        return run.finished_iterations
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is missing.
+
+        Raises:
+            RunError: The directory holds a run with other settings, or a damaged one.
+        """
+        return self.finished_iterations >= self.num_iterations
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """An experiment in some environments, with some seeds, at a scale, in a directory."""
+
+    experiment: Experiment
+    envs: tuple[str, ...]
+    seeds: tuple[int, ...]
+    preset: str
+    out: Path
+    """Runs go to `runs/` in it, the figure, CSV and table to a folder of their own."""
+    settings: Settings = dataclasses.field(default_factory=dict)
+    """Changes of every arm by dotted name; what an arm itself sets wins."""
+
+    def __post_init__(self):
+        for name in ("envs", "seeds"):
+            values = getattr(self, name)
+            if not values or len(set(values)) < len(values):
+                raise ConfigError(f"{name} is {values}, allowed: one or more, each once.")
+        object.__setattr__(self, "envs", tuple(env_spec(env).name for env in self.envs))
+
+    @property
+    def folder(self) -> Path:
+        """Where the figure, the raw numbers and the table go."""
+        return self.out / f"{self.experiment.name}-{self.preset}"
+
+    @property
+    def cells(self) -> dict[Cell, Job]:
+        """Every place of the table with the job that fills it; several may share one.
+
+        The order is that in which the jobs are best done: all arms with the first seed first.
+
+        Raises:
+            UnknownNameError: No such environment, method or preset.
+            ConfigError: A setting is unknown, of the wrong type or out of range.
+        """
+        return {
+            Cell(env, arm.label, seed): Job.of(self._config(arm, env, seed), self.out)
+            for seed in self.seeds
+            for env in self.envs
+            for arm in self.experiment.arms
+        }
+
+    @property
+    def jobs(self) -> list[Job]:
+        """Every job once."""
+        return unique(self.cells.values())
+
+    def _config(self, arm: Arm, env: str, seed: int) -> Config:
+        chosen = {**self.settings, **arm.settings}
+        return make_config(env, method=arm.method, preset=self.preset, seed=seed, settings=chosen)
+
+
+def unique(jobs: Iterable[Job]) -> list[Job]:
+    """The jobs without repetitions; a run is known by its directory."""
+    return list({job.path: job for job in jobs}.values())
+
+
+def fingerprint(config: Config) -> str:
+    """Ten letters that stand for all settings but the seed.
+
+    Only what differs from the defaults counts, so a setting that a later version adds does not
+    give the same run another name.
+    """
+    plain = Config(env=config.env, method=config.method, preset=config.preset, seed=config.seed)
+    changed = sorted(_lines(config) - _lines(plain))
+    return hashlib.sha256("\n".join(changed).encode()).hexdigest()[:10]
+
+
+def _lines(config: Config) -> set[str]:
+    """Every setting as one line of text."""
+    lines = set()
+    for section, values in settings.to_dict(config).items():
+        named = {section: values}
+        if isinstance(values, dict) and section != "sim_params":
+            named = {f"{section}.{name}": value for name, value in values.items()}
+        lines |= {f"{name}={json.dumps(value, sort_keys=True)}" for name, value in named.items()}
+    return lines

@@ -1,0 +1,82 @@
+"""The live table of a sweep on a terminal; needs rich, and is loaded only when shown."""
+
+from collections.abc import Sequence
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from headway.experiment.progress import duration
+from headway.sweeps.board import Board, describe
+from headway.sweeps.jobs import Job
+from headway.sweeps.status import Status
+
+_COLORS = {"running": "cyan", "busy": "yellow", "lost": "yellow", "done": "green", "failed": "red"}
+_ORDER = ("running", "lost", "busy", "failed", "waiting", "done")
+_OTHER_LINES = 5  # of the terminal, for headings and the prompt
+
+
+class LiveBoard(Board):
+    """Runs, iterations, returns and time left, redrawn in place; the busiest come first.
+
+    Args:
+        console: Where to draw; stderr by default.
+    """
+
+    def __init__(self, console: Console | None = None):
+        super().__init__()
+        self._console = console or Console(stderr=True)
+        self._live = Live(
+            console=self._console,
+            get_renderable=self._render,
+            refresh_per_second=2,
+            redirect_stdout=False,
+            transient=True,
+        )
+
+    def __enter__(self):
+        self._live.start()
+        return self
+
+    def __exit__(self, kind, error, trace) -> None:
+        """Remove the table; messages stay in the log above."""
+        self._live.stop()
+
+    def show(self, job: Job, before: Status, status: Status) -> None:
+        """Say what ended above the table, where it stays."""
+        if status.over:
+            text = f"{describe(job)}: {status.state}  {status.note or status.returns}"
+            self.message(text)
+
+    def message(self, text: str) -> None:
+        """Print a line above the table."""
+        self._console.print(text, markup=False, highlight=False)
+
+    def _render(self) -> RenderableType:
+        if not self.jobs:
+            return Text("preparing ...", style="dim")
+        shown = self._busiest(max(self._console.height - _OTHER_LINES, 3))
+        table = Table("run", "state", "iteration", "doing", "returns", "left", box=None)
+        for job in shown:
+            status = self.statuses[job.path]
+            table.add_row(
+                describe(job),
+                Text(status.state, style=_COLORS.get(status.state, "dim")),
+                f"{status.iteration}/{job.num_iterations}",
+                status.phase if status.state == "running" else "",
+                status.returns,
+                duration(status.left) if status.left and status.state == "running" else "",
+            )
+        return Group(table, Text(self._summary(len(shown)), style="dim"))
+
+    def _busiest(self, number: int) -> Sequence[Job]:
+        """The jobs to show when there is no room for all."""
+        states = {path: _ORDER.index(status.state) for path, status in self.statuses.items()}
+        return sorted(self.jobs.values(), key=lambda job: states[job.path])[:number]
+
+    def _summary(self, num_shown: int) -> str:
+        states = [status.state for status in self.statuses.values()]
+        counts = ", ".join(f"{states.count(s)} {s}" for s in _ORDER if s in states)
+        hidden = len(states) - num_shown
+        return f"{len(states)} runs: {counts}" + f"; {hidden} not shown" * bool(hidden)

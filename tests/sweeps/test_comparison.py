@@ -1,0 +1,251 @@
+"""Figure, raw numbers and table of an experiment, and the commands that make them."""
+
+import csv
+import json
+import re
+
+import fakes
+import numpy as np
+import pytest
+from PIL import Image
+
+from headway.cli import main
+from headway.cli.comparisons import read_seeds, read_settings
+from headway.cli.usage import UsageError
+from headway.compare import reproduce
+from headway.report.comparison import find, spread
+from headway.report.comparison_figure import arm_styles, has_curves
+from headway.sweeps import running
+from headway.sweeps.experiments import EXPERIMENTS, experiment
+from headway.sweeps.jobs import Comparison
+from headway.sweeps.running import Workers
+
+HERE = Workers(one_by_one=True)
+WORDS = ("--envs", "pendulum", "--preset", "smoke", "--one-by-one", "--quiet")
+
+
+@pytest.fixture
+def training(monkeypatch):
+    fake = fakes.FakeTraining()
+    monkeypatch.setattr(running, "train_run", fake)
+    return fake
+
+
+def comparison(out, name="fig13", seeds=(0, 1, 2), envs=("pendulum",), **settings):
+    return Comparison(experiment(name), envs, seeds, "smoke", out, settings)
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_files_stand_beside_each_other_and_hold_what_the_runs_say(training, tmp_path):
+    done = reproduce(comparison(tmp_path), workers=HERE, command="headway reproduce fig13")
+    folder = tmp_path / "fig13-smoke"
+    assert sorted(path.name for path in done.files) == [
+        "fig13.csv", "fig13.md", "fig13.png", "fig13.svg"
+    ]  # fmt: skip
+    assert {path.parent for path in done.files} == {folder}
+    rows = rows_of(folder / "fig13.csv")
+    # 2 arms, 3 seeds, 2 iterations, training physics and 2 unseen groups, 2 episodes
+    assert len(rows) == 2 * 3 * 2 * 3 * 2
+    unseen = [
+        float(row["return"])
+        for row in rows
+        if (row["arm"], row["seed"], row["iteration"]) == ("MCL", "2", "1")
+        and row["group"] != "train"
+    ]
+    assert np.mean(unseen) == 30 + 2 + 1  # see fakes.level
+    assert all((tmp_path / row["run"] / "config.json").exists() for row in rows)
+    table = (folder / "fig13.md").read_text()
+    assert "| MCL | 3 | 32.0 ± 1.0 | 132.0 ± 1.0 | – |" in table
+    assert "| T-MCL | 3 | 42.0 ± 1.0 | 142.0 ± 1.0 | – |" in table
+    assert "    headway reproduce fig13\n" in table
+    assert "can be claimed" not in table
+
+
+def test_figures_have_ink_and_svg_names_the_arms(training, tmp_path):
+    envs = ("pendulum", "hopper", "half-cheetah", "cartpole-swingup")
+    done = reproduce(comparison(tmp_path, envs=envs, seeds=(0, 1)), workers=HERE)
+    png, svg = (tmp_path / "fig13-smoke" / f"fig13.{kind}" for kind in ("png", "svg"))
+    pixels = np.asarray(Image.open(png).convert("L"))
+    assert 0.005 < (pixels < 200).mean() < 0.6
+    first = svg.read_bytes()
+    assert first.startswith(b"<?xml")
+    assert first.count(b"<!-- T-MCL -->") == 1  # matplotlib names drawn texts in comments
+    assert has_curves(done.found)
+    svg.unlink()
+    reproduce(comparison(tmp_path, envs=envs, seeds=(0, 1)), workers=HERE)
+    assert svg.read_bytes() == first
+
+
+def test_one_test_per_run_is_drawn_as_dots(training, tmp_path):
+    asked = comparison(tmp_path, **{"collection.num_iterations": 1})
+    done = reproduce(asked, workers=HERE)
+    assert not has_curves(done.found)
+    assert b"<!-- T-MCL -->" in (tmp_path / "fig13-smoke/fig13.svg").read_bytes()
+
+
+def test_training_curves_show_what_was_collected(training, tmp_path):
+    done = reproduce(comparison(tmp_path, "fig9", seeds=(0,)), workers=HERE)
+    rows = rows_of(tmp_path / "fig9-smoke/fig9.csv")
+    assert {row["group"] for row in rows} == {"collected"}
+    points = done.found.of("pendulum", "T-MCL")
+    assert [(point.iteration, point.value) for point in points] == [(0, 40.0), (1, 41.0)]
+
+
+def test_few_seeds_and_missing_runs_are_said(training, tmp_path):
+    training.answers = {1: [fakes.DIVERGED]}
+    done = reproduce(comparison(tmp_path, seeds=(0, 1)), workers=HERE)
+    assert len(done.failures) == 1
+    assert [tuple(cell) for cell in done.found.missing] == [("pendulum", "MCL", 1)]
+    table = (tmp_path / "fig13-smoke/fig13.md").read_text()
+    assert "Fewer than 3 seeds: no difference between arms can be claimed." in table
+    assert "Not finished: pendulum, MCL, seed 1." in table
+    assert "| MCL | 1 | 31.0 | 131.0 | – |" in table
+
+
+def test_another_figure_reuses_the_runs(training, tmp_path):
+    reproduce(comparison(tmp_path, seeds=(0,)), workers=HERE)
+    before = len(training.calls)
+    done = reproduce(comparison(tmp_path, "fig15", seeds=(0,)), workers=HERE)
+    assert (before, len(training.calls)) == (2, 2 + 3)
+    assert len(done.found.final_points) == 5
+
+
+def test_nothing_finished_makes_no_figure_but_a_table(tmp_path):
+    found = find(comparison(tmp_path))
+    assert len(found.missing) == 6
+    assert found.points == []
+
+
+def test_spread_is_over_seeds():
+    assert spread([]) == "–"
+    assert spread([1234.5]) == "1,234.5"
+    assert spread([1.0, 3.0]) == "2.0 ± 1.4"
+
+
+def test_many_arms_can_be_told_apart():
+    styles = arm_styles([f"arm {i}" for i in range(20)])
+    assert len(set(styles.values())) == 20
+
+
+def run(capsys, *words):
+    """Exit code, stdout and stderr of one command."""
+    code = main(words)
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_reproduce_on_the_command_line(training, tmp_path, capsys):
+    words = ("reproduce", "fig13", *WORDS, "--seeds", "0:2", "--out", str(tmp_path))
+    code, out, _ = run(capsys, *words)
+    assert code == 0
+    assert re.search(r"T-MCL +2 +41.5 ± 0.7 +141.5 ± 0.7", out)
+    assert "headway reproduce fig13 --envs pendulum --preset smoke" in out
+    code, out, _ = run(capsys, *words, "--json")
+    facts = json.loads(out)
+    assert (code, facts["runs"], facts["failures"], len(facts["files"])) == (0, 4, {}, 4)
+    assert {(p["arm"], p["seed"], p["value"]) for p in facts["returns"]} == {
+        ("MCL", 0, 31.0), ("MCL", 1, 32.0), ("T-MCL", 0, 41.0), ("T-MCL", 1, 42.0)
+    }  # fmt: skip
+    assert len(training.calls) == 4
+
+
+def test_a_failed_run_is_told_on_stderr_with_exit_code_1(training, tmp_path, capsys):
+    training.answers = {0: [fakes.DIVERGED]}
+    words = ("reproduce", "fig13", *WORDS, "--seeds", "0", "--out", str(tmp_path))
+    code, out, err = run(capsys, *words)
+    assert code == 1
+    assert "seed0: no finite number" in err
+    assert "T-MCL" in out
+
+
+def test_dry_run_lists_and_runs_nothing(training, tmp_path, capsys):
+    words = ("reproduce", "fig15", *WORDS, "--seeds", "0", "--out", str(tmp_path), "--dry-run")
+    code, out, _ = run(capsys, *words)
+    assert code == 0
+    assert "5 of 5 runs are missing" in out
+    code, out, _ = run(capsys, *words, "--json")
+    facts = json.loads(out)
+    assert [entry["state"] for entry in facts["runs"]] == ["waiting"] * 5
+    assert facts["runs"][0]["arms"] == ["M = 1"]
+    assert training.calls == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_sweep_on_the_command_line(training, tmp_path, capsys):
+    code, out, _ = run(
+        capsys, "sweep", *WORDS, "--seeds", "5", "--out", str(tmp_path), "--name", "mine",
+        "--methods", "pets", "tmcl", "--settings", "planner.horizon=3,5", "--json",
+    )  # fmt: skip
+    assert code == 0
+    assert [point["arm"] for point in json.loads(out)["returns"]] == [
+        "PETS, planner.horizon 3", "PETS, planner.horizon 5",
+        "T-MCL, planner.horizon 3", "T-MCL, planner.horizon 5",
+    ]  # fmt: skip
+    assert (tmp_path / "mine-smoke/mine.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "seeds"), [(["0:3"], (0, 1, 2)), (["4"], (4,)), (["1", "7:9"], (1, 7, 8))]
+)
+def test_seeds(words, seeds):
+    assert read_seeds(words) == seeds
+
+
+@pytest.mark.parametrize("word", ["x", "3:3", "3:1", "-1", "0:99999999", "1:2:3"])
+def test_bad_seeds(word):
+    with pytest.raises(UsageError, match=r"--seeds is .*allowed"):
+        read_seeds([word])
+
+
+def test_settings_are_json_or_text():
+    words = ["model.hidden_sizes=[8,8],[9]", "planner.head-selection=average", "a=1,2.5"]
+    assert read_settings(words) == {
+        "model.hidden_sizes": [[8, 8], [9]],
+        "planner.head_selection": ["average"],
+        "a": [1, 2.5],
+    }
+
+
+@pytest.mark.parametrize("words", [["a"], ["a="], ["=1"], ["a=1", "a=2"]])
+def test_bad_settings(words):
+    with pytest.raises(UsageError, match=r"--settings is"):
+        read_settings(words)
+
+
+def test_reproduce_takes_one_value_of_a_setting(tmp_path, capsys):
+    words = ("reproduce", "fig13", *WORDS, "--settings", "planner.horizon=1,2")
+    code, _, err = run(capsys, *words)
+    assert code == 2
+    assert "planner.horizon has 2 values, allowed: one" in err
+
+
+def test_an_unknown_experiment_is_told_with_the_closest(capsys):
+    code, _, err = run(capsys, "reproduce", "fgi13", *WORDS)
+    assert code == 1
+    assert "Did you mean 'fig13'?" in err
+
+
+def test_a_real_run_through_the_command_line(tmp_path, capsys):
+    settings = [f"{name}={json.dumps(value)}" for name, value in fakes.TINY.items()]
+    words = ("reproduce", "fig10", *WORDS, "--seeds", "0", "--out", str(tmp_path))
+    code, out, _ = run(capsys, *words, "--settings", *settings, "--json")
+    assert code == 0
+    returns = {point["arm"]: point["value"] for point in json.loads(out)["returns"]}
+    assert set(returns) == {"PETS", "Multi-Headed PETS"}
+    assert all(-200 < value < 0 for value in returns.values())
+    code, again, _ = run(capsys, *words, "--settings", *settings, "--json")
+    assert again == out
+
+
+def test_experiments_are_listed(capsys):
+    code, out, _ = run(capsys, "list", "experiments")
+    assert code == 0
+    assert all(name in out for name in EXPERIMENTS)
+    code, out, _ = run(capsys, "list", "experiments", "--json")
+    entries = json.loads(out)["experiments"]
+    assert [entry["name"] for entry in entries] == list(EXPERIMENTS)
+    assert entries[-1]["arms"][2]["settings"] == {"fitting.oracle": "independent"}

@@ -1,0 +1,197 @@
+"""Missing runs are made once each, whatever happens to some of them."""
+
+import io
+
+import fakes
+import pytest
+from rich.console import Console
+
+from headway.errors import ConfigError
+from headway.experiment.run_lock import locked
+from headway.sweeps import running
+from headway.sweeps.board import PlainBoard
+from headway.sweeps.cost import make_plan, run_flop
+from headway.sweeps.live_board import LiveBoard
+from headway.sweeps.running import Workers, run_jobs
+from headway.sweeps.status import Status, StatusProgress
+
+HERE = Workers(one_by_one=True)
+
+
+@pytest.fixture
+def training(monkeypatch):
+    """Replaces training by writing; runs that are held are tried again at once."""
+    fake = fakes.FakeTraining()
+    monkeypatch.setattr(running, "train_run", fake)
+    monkeypatch.setattr(running, "PATIENCE", 0.0)
+    return fake
+
+
+def test_runs_are_made_in_order_and_only_once(training, tmp_path):
+    jobs = [fakes.tiny_job(tmp_path, seed) for seed in (2, 0, 1)]
+    board = fakes.Remembering()
+    run_jobs(jobs, HERE, board)
+    assert [seed for _, seed in training.calls] == [2, 0, 1]
+    assert all(status.state == "done" for status in board.statuses.values())
+    assert board.states(jobs[0]) == ["running", "running", "running", "done"]
+    again = fakes.Remembering()
+    run_jobs([*jobs, fakes.tiny_job(tmp_path, 3)], HERE, again)
+    assert [seed for _, seed in training.calls] == [2, 0, 1, 3]
+
+
+def test_a_run_that_fails_does_not_stop_the_others(training, tmp_path):
+    training.answers = {0: [fakes.DIVERGED]}
+    jobs = [fakes.tiny_job(tmp_path, seed) for seed in (0, 1)]
+    board = fakes.Remembering()
+    run_jobs(jobs, HERE, board)
+    assert board.failures == {jobs[0].path: "no finite number"}
+    assert jobs[1].finished
+
+
+def test_a_damaged_directory_is_told_and_left_alone(training, tmp_path):
+    jobs = [fakes.tiny_job(tmp_path, seed) for seed in (0, 1)]
+    jobs[0].path.mkdir(parents=True)
+    (jobs[0].path / "config.json").write_text("{")
+    board = fakes.Remembering()
+    run_jobs(jobs, HERE, board)
+    assert "config.json is damaged" in board.failures[jobs[0].path]
+    assert [seed for _, seed in training.calls] == [1]
+
+
+def test_a_run_that_another_process_holds_is_waited_for(training, tmp_path):
+    training.answers = {0: [fakes.BUSY, fakes.BUSY]}
+    jobs = [fakes.tiny_job(tmp_path, seed) for seed in (0, 1)]
+    board = fakes.Remembering()
+    run_jobs(jobs, HERE, board)
+    assert [seed for _, seed in training.calls] == [0, 1, 0, 0]
+    assert [state for state in board.states(jobs[0]) if state != "running"] == [
+        "busy",
+        "busy",
+        "done",
+    ]
+
+
+def test_what_the_other_process_finished_is_not_made_again(training, tmp_path, monkeypatch):
+    job = fakes.tiny_job(tmp_path)
+    training.answers = {0: [fakes.BUSY]}
+    monkeypatch.setattr(running.time, "sleep", lambda _: fakes.write_run(job.config, job.path))
+    run_jobs([job], HERE, fakes.Remembering())
+    assert len(training.calls) == 1
+
+
+def test_a_held_directory_is_busy(tmp_path):
+    job = fakes.tiny_job(tmp_path)
+    job.path.mkdir(parents=True)
+    with locked(job.path):
+        status = running.make_run(job, lambda _: None)
+    assert status.state == "busy"
+    assert "another process" in status.note
+
+
+def test_without_ray_it_says_what_to_install(training, tmp_path, monkeypatch):
+    monkeypatch.setattr(running, "ray_is_installed", lambda: False)
+    jobs = [fakes.tiny_job(tmp_path, seed) for seed in (0, 1)]
+    board = fakes.Remembering()
+    run_jobs(jobs, Workers(), board)
+    assert len(training.calls) == 2
+    assert "pip install 'headway[ray]'" in board.messages[0]
+    with pytest.raises(ConfigError, match=r"pip install 'headway\[ray\]'"):
+        run_jobs([fakes.tiny_job(tmp_path, 2)], Workers(address="auto"), board)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"cpus_per_run": 0}, {"gpus_per_run": -1}, {"one_by_one": True, "address": "auto"}]
+)
+def test_impossible_workers_are_refused(wrong):
+    with pytest.raises(ConfigError, match=r"allowed|leave one out"):
+        Workers(**wrong)
+
+
+def test_status_follows_a_run_and_reports_seldom():
+    now = [0.0]
+    told = []
+    progress = StatusProgress(told.append, 1, clock=lambda: now[0])
+    assert told[-1] == Status("running", 1, "preparing")
+    progress.phase(1, 3, "collect", 10)
+    for _ in range(10):
+        now[0] += 0.2
+        progress.advance(1)
+    assert [status.phase for status in told[2:]] == ["collect 30%", "collect 60%", "collect 90%"]
+    assert told[-1].left is not None
+    metrics = {"iteration": 1, "collection": {"return_mean": -5.0, "return_std": 1.0}}
+    progress.iteration_done(metrics)
+    assert (told[-1].iteration, told[-1].returns) == (2, "collected -5 ± 1")
+
+
+def test_reports_after_the_end_change_nothing(tmp_path):
+    board = fakes.Remembering()
+    job = fakes.tiny_job(tmp_path)
+    board.begin([job])
+    board.tell(job, Status("done", 2))
+    board.tell(job, Status("running", 1))
+    assert board.statuses[job.path] == Status("done", 2)
+
+
+def test_lines_say_what_begins_and_ends(tmp_path):
+    stream = io.StringIO()
+    job = fakes.tiny_job(tmp_path)
+    with PlainBoard(stream) as board:
+        board.begin([job])
+        board.tell(job, Status("running", 0, "fit 10%"))
+        board.tell(job, Status("running", 0, "fit 20%"))
+        board.tell(job, Status("running", 1, "fit 0%", "collected -5", left=90.0))
+        board.tell(job, Status("failed", 1, note="no finite number"))
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == 4
+    assert lines[0] == "1 runs, 0 of them done already"
+    assert lines[2].endswith("running  1/2  collected -5; about 1 min 30 s left")
+    assert lines[3].startswith("[1/1] ")
+    assert lines[3].endswith("failed  1/2  no finite number")
+
+
+def test_the_live_table_shows_every_run_and_the_busiest_first(tmp_path):
+    console = Console(
+        file=io.StringIO(), width=160, height=9, force_terminal=True, color_system=None
+    )
+    jobs = [fakes.tiny_job(tmp_path, seed) for seed in range(6)]
+    board = LiveBoard(console)
+    board.begin(jobs)
+    board.tell(jobs[4], Status("running", 1, "fit 40%", "collected -310 ± 55", left=200.0))
+    board.tell(jobs[0], Status("done", 2))
+    with console.capture() as captured:
+        console.print(board._render())
+    lines = captured.get().splitlines()
+    assert lines[1].split() == [
+        *jobs[4].path.parts[-3:], "running", "1/2", "fit", "40%", "collected", "-310", "±", "55",
+        "3", "min", "20", "s",
+    ]  # fmt: skip
+    assert lines[-1].strip() == "6 runs: 1 running, 4 waiting, 1 done; 2 not shown"
+
+
+def test_an_estimate_counts_what_is_missing_at_the_speed_of_what_is_done(tmp_path):
+    jobs = [fakes.tiny_job(tmp_path, seed) for seed in range(3)]
+    plan = make_plan(jobs)
+    assert [one.state for one in plan.jobs] == ["waiting"] * 3
+    assert "just now" in plan.source
+    fakes.write_run(jobs[0].config, jobs[0].path)
+    plan = make_plan(jobs)
+    assert [one.state for one in plan.jobs] == ["done", "waiting", "waiting"]
+    # The fake run says that it took 4 seconds per iteration, and has 2.
+    assert plan.seconds() == pytest.approx(16.0)
+    assert plan.source == "1 finished runs"
+
+
+def test_arithmetic_of_a_run_follows_its_settings(tmp_path):
+    def flop(first_iteration=0, **changes):
+        return run_flop(fakes.tiny_job(tmp_path, **changes).config, first_iteration)
+
+    whole = flop()
+    assert 0 < flop(1) < whole
+    assert flop(2) == 0
+    # Pendulum has two unseen groups of two episodes of six steps, tested twice, the training
+    # physics once, and collects two planned episodes; the rest is fitting.
+    steps = (2 * 2 + 1) * 2 * 6 + 2 * 6
+    per_step = (flop(**{"planner.horizon": 6}) - whole) / steps / 3
+    assert flop(**{"planner.horizon": 12}) == pytest.approx(whole + 9 * steps * per_step)
+    fit = flop(**{"fitting.epochs": 2}) - whole
+    assert whole == pytest.approx(fit + 3 * steps * per_step)
