@@ -7,7 +7,7 @@ import dataclasses
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import jax
 import numpy as np
@@ -169,7 +169,7 @@ def _restore(part: Part, num_episodes: int, path: Path) -> Rollout:
     return Rollout(trajectories, PlannerUse(**use))
 
 
-def _is_use(values: Any) -> bool:
+def _is_use(values: Any) -> TypeGuard[dict[str, Any]]:
     """Whether something read from a file is what planning took, by name."""
     types = {name: type(value) for name, value in dataclasses.asdict(PlannerUse()).items()}
     return isinstance(values, dict) and {n: type(v) for n, v in values.items()} == types
