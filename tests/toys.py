@@ -77,8 +77,10 @@ def lay_out(trajectories, *, max_length=None, capacity=None, future_length=2, sa
 def small_model(seed=0, task=POINT, config=SMALL):
     """A random model whose biases and variance bounds are not at their initial values either."""
     rng = np.random.default_rng(seed)
+    names = ("gain", "drag") if config.context == "sim-params" else ()
     shapes = jax.eval_shape(
-        lambda key: MultiHeadDynamics.init(config, task, key=key), jax.random.key(0)
+        lambda key: MultiHeadDynamics.init(config, task, sim_param_names=names, key=key),
+        jax.random.key(0),
     )
 
     def draw(path, leaf):
@@ -112,7 +114,7 @@ def identity_statistics(task=POINT, history_length=3):
     return Statistics.identity(task, history_length)
 
 
-def odd_statistics(task=POINT, history_length=3, seed=5):
+def odd_statistics(task=POINT, history_length=3, seed=5, sim_param_names=()):
     """Normalisers that shift and scale everything differently."""
     rng = np.random.default_rng(seed)
 
@@ -120,7 +122,7 @@ def odd_statistics(task=POINT, history_length=3, seed=5):
         shift, scale = rng.normal(size=like.shape), rng.uniform(0.5, 2.0, like.shape)
         return jnp.asarray(scale if (like == 1).all() else shift, jnp.float32)
 
-    return jax.tree.map(odd, Statistics.identity(task, history_length))
+    return jax.tree.map(odd, Statistics.identity(task, history_length, sim_param_names))
 
 
 def softplus(x):

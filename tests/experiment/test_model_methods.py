@@ -1,0 +1,216 @@
+"""Methods that differ in the model: their settings, smoke runs, resuming, and what they learn."""
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+
+import headway
+import headway.envs
+from headway.data import Trajectory
+from headway.experiment import limits, training
+from headway.experiment.blocks import BlockedData, Layout, fit_blocks
+from headway.experiment.methods import make_config, told_sim_params
+from headway.models.dynamics import Statistics
+from headway.models.fitting import FitSetup
+from headway.settings import differences
+
+NEW = ("stacked", "cadm", "pets-cadm", "oracle-params", "ria")
+TINY = {"collection.episode_length": 12, "fitting.epochs": 1}
+
+
+def settings_of(method, **kwargs):
+    config = make_config("half-cheetah", method=method, **kwargs)
+    return config.model, config.fitting, config.planner
+
+
+def test_cadm_has_its_own_choices():
+    for method in ("cadm", "pets-cadm"):
+        model, fitting, planner = settings_of(method)
+        assert (model.context, model.context_at, model.context_size) == ("learned", "input", 10)
+        assert (model.history_length, fitting.future_length) == (10, 10)
+        assert model.backward_net
+        assert model.backward_deterministic
+        assert (fitting.oracle, fitting.backward_weight, fitting.batch_size) == (
+            "independent",
+            0.5,
+            256,
+        )
+        assert fitting.context_weight_decay
+        alone = method == "cadm"
+        assert (model.num_members, planner.num_particles) == ((1, 1) if alone else (5, 20))
+        assert model.deterministic == alone
+
+
+def test_ria_has_its_own_choices():
+    model, fitting, _ = settings_of("ria")
+    assert (model.num_heads, model.num_members, model.context_at) == (1, 5, "last-hidden")
+    assert model.relation_head
+    assert not model.backward_deterministic
+    assert (fitting.batch_size, fitting.future_length, fitting.backward_weight) == (200, 5, 0.5)
+    assert (fitting.relation_temperature, fitting.relation_distance_weight) == (0.6, 1.0)
+    assert fitting.relation_transitions == 0
+
+
+def test_stacked_is_vanilla_but_for_its_input():
+    stacked, vanilla = (make_config("pendulum", method=name) for name in ("stacked", "vanilla"))
+    changed = {line.partition(":")[0] for line in differences(vanilla, stacked)}
+    assert changed == {"method", "model.context", "model.context_at", "model.context_size"}
+
+
+def test_only_oracle_params_is_told_the_physics():
+    told = {name: told_sim_params(make_config("pendulum", method=name)) for name in NEW}
+    assert told.pop("oracle-params") == ("length", "mass")
+    assert set(told.values()) == {()}
+    own = headway.SimParamSets({"mass": (1.0,), "length": (0.5, 1.0)})
+    config = make_config("pendulum", method="oracle-params", settings={"sim_params": own})
+    assert told_sim_params(config) == ("mass", "length")
+
+
+SPREAD = [
+    ("stacked", "hopper"),
+    ("cadm", "cartpole-swingup"),
+    ("pets-cadm", "half-cheetah"),
+    ("oracle-params", "crippled-ant"),
+    ("ria", "slim-humanoid"),
+]
+
+
+@pytest.mark.parametrize(("method", "env"), SPREAD)
+def test_smoke_run_of_every_method(method, env, tmp_path):
+    config = make_config(env, method=method, preset="smoke", settings=TINY)
+    run = training.train_run(config, tmp_path / "run")
+    metrics = run.metrics()
+    assert [m["iteration"] for m in metrics] == [0, 1]
+    assert np.isfinite([m["fitting"]["loss"] for m in metrics]).all()
+    assert sum(m["fitting"]["skipped_updates"] for m in metrics) == 0
+    assert np.isfinite([row.episode_return for row in run.evaluation()]).all()
+    assert {row.group for row in run.evaluation()} >= set(headway.env_spec(env).sim_params.unseen)
+
+
+ABLATIONS = [
+    ("tmcl", {"model.context_size": 0, "model.backward_net": False}),
+    ("mh-pets", {"planner.head_selection": "adaptive", "planner.selection_length": 3}),
+    ("mcl", {"planner.head_selection": "random", "model.num_heads": 2}),
+    ("tmcl", {"fitting.segment_length": 5, "model.context_at": "input"}),
+]
+
+
+@pytest.mark.parametrize(("method", "settings"), ABLATIONS, ids=str)
+def test_ablations_of_the_supplement_are_settings(method, settings, tmp_path):
+    tiny = {"collection.episode_length": 8, "fitting.epochs": 1, "planner.num_iterations": 1}
+    config = make_config("pendulum", method=method, preset="smoke", settings={**tiny, **settings})
+    metrics = training.train_run(config, tmp_path / "run").metrics()
+    assert np.isfinite([m["fitting"]["loss"] for m in metrics]).all()
+    assert len(metrics) == 2
+
+
+@pytest.mark.parametrize("method", ["ria", "oracle-params"])
+def test_a_run_with_new_parts_resumes_where_it_was_stopped(method, tmp_path, monkeypatch):
+    config = make_config("pendulum", method=method, preset="smoke", settings=TINY)
+    whole = training.train_run(config, tmp_path / "whole")
+    stop_after = training.Trainer.run_iteration
+
+    class StoppedError(Exception):
+        pass
+
+    def stopped(trainer, iteration):
+        stop_after(trainer, iteration)
+        raise StoppedError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(training.Trainer, "run_iteration", stopped)
+        with pytest.raises(StoppedError):
+            training.train_run(config, tmp_path / "parts")
+    parts = training.train_run(config, tmp_path / "parts")
+    for iteration in (0, 1):
+        first, second = (run.checkpoint(iteration).read_bytes() for run in (whole, parts))
+        assert first == second
+    assert whole.evaluation() == parts.evaluation()
+
+
+def test_a_controller_from_a_run_is_told_the_physics(tmp_path):
+    config = make_config("pendulum", method="oracle-params", preset="smoke", settings=TINY)
+    run = training.train_run(config, tmp_path / "run")
+    controller = headway.load(run.path)
+    env = gymnasium.make("headway/Pendulum-v0")
+    obs, info = env.reset(seed=1, options={"sim_params": {"length": 1.75}})
+    controller.reset(sim_params=info["sim_params"])
+    assert env.action_space.contains(controller.act(obs))
+
+
+@pytest.mark.parametrize("env", ["pendulum", "half-cheetah"])
+@pytest.mark.parametrize("method", NEW)
+def test_weights_of_every_method_are_counted(method, env):
+    config = make_config(env, method=method)
+    task = training.load_task(config)
+    model = training.eqx.filter_eval_shape(lambda: training.initial(config, task)).fit.model
+    counted = sum(leaf.size for leaf in jax.tree.leaves(model))
+    assert counted == pytest.approx(limits.num_parameters(config, task), rel=0.1)
+
+
+def test_comparing_all_contexts_takes_memory():
+    pairs = {}
+    for method in ("pets-cadm", "ria"):
+        config = make_config("half-cheetah", method=method, settings={"fitting.batch_size": 1000})
+        task = training.load_task(config)
+        pairs[method] = limits.memory_need(config, task, 1000).fitting
+    assert pairs["ria"] - pairs["pets-cadm"] > 5 * 1000**2 * 18 * 4
+
+
+def masses(num_episodes, steps=30, seed=0):
+    """A force moves a mass; episodes have one of two masses. State: position and velocity."""
+    rng = np.random.default_rng(seed)
+    trajectories = []
+    for episode in range(num_episodes):
+        mass = (0.5, 2.0)[episode % 2]
+        force = rng.uniform(-1, 1, (steps, 1)).astype(np.float32)
+        speed = np.concatenate([[0.0], np.cumsum(0.5 * force[:, 0] / mass)])
+        obs = np.stack([np.cos(speed), np.sin(speed), speed], 1).astype(np.float32)
+        trajectories.append(Trajectory(obs, force, np.zeros(steps), {"mass": mass, "length": 1.0}))
+    return trajectories
+
+
+def fitted_error(method):
+    """Squared error of the speed's change on new episodes, in its own variance."""
+    config = make_config(
+        "pendulum",
+        method=method,
+        preset="smoke",
+        settings={
+            "model.num_members": 1,
+            "model.deterministic": True,
+            "model.hidden_sizes": (32, 32),
+            "planner.num_particles": 1,
+            "fitting.learning_rate": 5e-3,
+            "fitting.batch_size": 64,
+            "collection.num_episodes": 8,
+            "collection.episode_length": 30,
+            "model.history_length": 5,
+        },
+    )
+    task, train, names = training.load_task(config), masses(16), told_sim_params(config)
+    setup = FitSetup(task, config.fitting, 5)
+    statistics = Statistics.fit(task, train, 5, names)
+    key = jax.random.key(0)
+    data = BlockedData(train, Layout.of(config, 30), statistics, setup, 1, key)
+    state = training.initial(config, task).fit
+    state, _ = fit_blocks(state, setup, data.stream(60, key), independent=True)
+    test = masses(4, seed=1)
+    episodes = Layout(4, 30, names).episodes(test)
+    row, step = np.repeat(np.arange(4), 25), np.tile(np.arange(5, 30), 4)
+    past = episodes.history(row[None], step[None], 5)
+    context = state.model.context(past, statistics, episodes.sim_params[row][None])
+    obs, action = episodes.obs[row, step][None], episodes.action[row, step][None]
+    x = training.eqx.filter_jit(headway.models.dynamics.network_input)
+    mean = state.model.forward_net(x(task, statistics, obs, action), context).mean[0, 0, :, 2]
+    delta = np.asarray(episodes.obs[row, step + 1] - episodes.obs[row, step])[:, 2]
+    got = np.asarray(mean) * statistics.delta.std[2] + statistics.delta.mean[2]
+    return float(np.square(got - delta).mean() / delta.var())
+
+
+def test_history_and_true_parameters_help_where_the_mass_is_hidden():
+    errors = {method: fitted_error(method) for method in ("vanilla", "stacked", "oracle-params")}
+    assert errors["vanilla"] > 0.15
+    assert errors["stacked"] < 0.5 * errors["vanilla"]
+    assert errors["oracle-params"] < 0.1 * errors["vanilla"]
