@@ -18,7 +18,7 @@ from headway.cli.arguments import (
     WithSettings,
     changed_settings,
 )
-from headway.cli.reports import report
+from headway.cli.reports import diagnose, report
 from headway.cli.usage import UsageError, parse, wants_help
 from headway.config import Config
 from headway.errors import ConfigError, unknown_name
@@ -135,6 +135,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "evaluate": evaluate,
     "list": list_names,
     "plot-dynamics": plot_dynamics,
+    "diagnose": diagnose,
     "report": report,
 }
 
