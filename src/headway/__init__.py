@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from headway.planning.optimizers import ICEM as ICEM
     from headway.planning.optimizers import MPPI as MPPI
     from headway.planning.optimizers import RandomShooting as RandomShooting
+    from headway.report.diagnosis import Diagnosis as Diagnosis
+    from headway.report.diagnosis import diagnose as diagnose
     from headway.report.dynamics import plot_dynamics as plot_dynamics
     from headway.report.page.build import write_report as write_report
     from headway.sim_params import SimParamSets as SimParamSets
@@ -68,6 +70,7 @@ _HOME = {
     "planning.agent": ("Agent",),
     "planning.controller": ("Controller",),
     "planning.optimizers": ("CEM", "ICEM", "MPPI", "RandomShooting"),
+    "report.diagnosis": ("Diagnosis", "diagnose"),
     "report.dynamics": ("plot_dynamics",),
     "report.page.build": ("write_report",),
     "sim_params": ("SimParamSets",),

@@ -5,18 +5,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
 
-import jax
-
 from headway.config import Config
-from headway.errors import unknown_name
-from headway.experiment.evaluation import PlanningCost, episode_rows, evaluate_agent
-from headway.experiment.limits import check_memory
-from headway.experiment.methods import config_to_evaluate, make_config
+from headway.experiment.evaluation import PlanningCost, episode_rows
+from headway.experiment.methods import make_config
 from headway.experiment.progress import Progress
-from headway.experiment.rollouts import Arena
 from headway.experiment.runs import RunDir
 from headway.experiment.tables import EpisodeRow
-from headway.experiment.training import load_agent, need_of, train_run
+from headway.experiment.testing import run_tests
+from headway.experiment.training import load_agent, train_run
 from headway.planning.controller import Controller
 from headway.report.figures import save_run_figures
 
@@ -134,27 +130,12 @@ def evaluate(
             training has fixed.
         LimitError: Planning needs more memory than is free.
     """
-    run = RunDir(run_dir)
-    changes = dict(settings or {})
-    if num_episodes is not None:
-        changes["evaluation.num_episodes"] = num_episodes
-    config = config_to_evaluate(run.config(), changes)
-    check_memory(need_of(config).to_test)
-    arena = Arena.make(config)
-    agent = load_agent(run, config, arena)
-    known = arena.sim_params.group_names
-    for group in groups or ():
-        if group not in known:
-            raise unknown_name("group", group, known)
-    groups = list(dict.fromkeys(groups or known))
-    iteration = run.finished_iterations - 1
-    with progress or Progress() as shown:
-        total = len(groups) * config.evaluation.num_episodes * arena.episode_length
-        shown.phase(iteration, run.finished_iterations, "evaluate", total)
-        key = jax.random.key(config.evaluation.seed)
-        found, use = evaluate_agent(agent, arena, config, groups, key=key, on_step=shown.advance)
-    rows = episode_rows(config, iteration, found)
-    return Evaluation(rows, config, PlanningCost.of(use, config, arena.task))
+    tested = run_tests(
+        run_dir, groups=groups, num_episodes=num_episodes, settings=settings, progress=progress
+    )
+    rows = episode_rows(tested.config, tested.iteration, tested.trajectories)
+    cost = PlanningCost.of(tested.use, tested.config, tested.arena.task)
+    return Evaluation(rows, tested.config, cost)
 
 
 def load(run_dir: str | Path, *, seed: int = 0) -> Controller:

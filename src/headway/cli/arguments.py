@@ -156,7 +156,10 @@ class Evaluate:
 class Report:
     """Compare runs on one HTML page that needs nothing else: no network, no other file."""
 
-    runs: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN [RUN ...]")]
+    runs: Annotated[
+        tyro.conf.Positional[tuple[Path, ...]],
+        tyro.conf.arg(metavar="RUN [RUN ...]", help_behavior_hint=""),
+    ]
     """Run directories, or folders that hold some; any methods, environments and seeds."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("report.html")
     """The HTML file to write."""
@@ -179,6 +182,9 @@ class Diagnose:
     """Groups of physics: `train` or unseen groups."""
     episodes: Annotated[int | None, _unset("as in the run's own tests")] = None
     """Episodes per group."""
+    collected: Flag = False
+    """Take the episodes that the last iteration collected instead of running tests: done at once,
+    but training physics only, and the model has learned from them since."""
     json: Flag = False
     """Print one JSON line on stdout instead of tables."""
     quiet: Flag = False

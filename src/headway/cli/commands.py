@@ -19,7 +19,7 @@ from headway.cli.arguments import (
 from headway.cli.comparisons import reproduce, sweep
 from headway.cli.output import print_json as _print_json
 from headway.cli.output import print_tables as _print_tables
-from headway.cli.reports import report
+from headway.cli.reports import diagnose, report
 from headway.cli.usage import UsageError, parse, wants_help
 from headway.config import Config
 from headway.errors import ConfigError, unknown_name
@@ -138,6 +138,7 @@ COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "sweep": sweep,
     "list": list_names,
     "plot-dynamics": plot_dynamics,
+    "diagnose": diagnose,
     "report": report,
 }
 

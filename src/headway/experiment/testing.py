@@ -1,0 +1,82 @@
+"""Running the test episodes of a trained run once more, outside of its training."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from headway.config import Config
+from headway.data import Trajectory
+from headway.errors import unknown_name
+from headway.experiment.evaluation import evaluate_agent
+from headway.experiment.limits import check_memory
+from headway.experiment.methods import config_to_evaluate
+from headway.experiment.progress import Progress
+from headway.experiment.rollouts import Arena, PlannerUse
+from headway.experiment.runs import RunDir
+from headway.experiment.training import load_agent, need_of
+from headway.planning.acting import Acting
+
+
+@dataclasses.dataclass(frozen=True)
+class Tested:
+    """Test episodes, and what they were run with."""
+
+    config: Config
+    """All settings, as they were tested."""
+    iteration: int
+    """The run's last finished iteration."""
+    agent: Acting
+    arena: Arena
+    trajectories: dict[str, list[Trajectory]]
+    """By group, in the order of the episodes."""
+    use: PlannerUse
+    """What planning took."""
+
+
+def run_tests(
+    run_dir: str | Path,
+    *,
+    groups: Sequence[str] | None = None,
+    num_episodes: int | None = None,
+    settings: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> Tested:
+    """Run test episodes with the run's protocol; nothing in its directory changes.
+
+    Args:
+        run_dir: The run directory.
+        groups: `train` or unseen groups; all of them by default.
+        num_episodes: Episodes per group; the run's own number by default.
+        settings: Changes of `planner` and `evaluation` settings by dotted name.
+        progress: Shown while testing; silent by default.
+
+    Raises:
+        RunError: There is no trained run, or it is damaged.
+        UnknownNameError: No such group.
+        ConfigError: A setting is unknown, of the wrong type or out of range, or one that
+            training has fixed.
+        LimitError: Planning needs more memory than is free.
+    """
+    run = RunDir(run_dir)
+    changes = dict(settings or {})
+    if num_episodes is not None:
+        changes["evaluation.num_episodes"] = num_episodes
+    config = config_to_evaluate(run.config(), changes)
+    check_memory(need_of(config).to_test)
+    arena = Arena.make(config)
+    agent = load_agent(run, config, arena)
+    known = arena.sim_params.group_names
+    for group in groups or ():
+        if group not in known:
+            raise unknown_name("group", group, known)
+    groups = list(dict.fromkeys(groups or known))
+    iteration = run.finished_iterations - 1
+    with progress or Progress() as shown:
+        total = len(groups) * config.evaluation.num_episodes * arena.episode_length
+        shown.phase(iteration, run.finished_iterations, "evaluate", total)
+        key = jax.random.key(config.evaluation.seed)
+        found, use = evaluate_agent(agent, arena, config, groups, key=key, on_step=shown.advance)
+    return Tested(config, iteration, agent, arena, found, use)

@@ -1,0 +1,256 @@
+"""How well a trained run selects heads and knows its own error, as tables and as plain values."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+from rich.table import Table
+
+from headway.config import Config
+from headway.data import Trajectory
+from headway.errors import ConfigError
+from headway.experiment.progress import Progress
+from headway.experiment.runs import RunDir
+from headway.experiment.selection import (
+    LEVELS,
+    EpisodeSelection,
+    SelectionSummary,
+    examine,
+    summarise,
+)
+from headway.experiment.testing import run_tests
+from headway.experiment.training import load_agent
+from headway.planning.agent import Agent
+from headway.report.physics import distinct, full_label, varying
+from headway.report.tables import new_table
+
+Facts = dict[str, Any]
+
+COLLECTED = "collected"
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """How heads were selected in a run's test episodes."""
+
+    path: Path
+    """The run directory."""
+    config: Config
+    """All settings."""
+    episodes: dict[str, list[EpisodeSelection]]
+    """What all heads predicted, by group and in the order of the episodes."""
+
+    @property
+    def window(self) -> int:
+        """Right selections in a row after which selection has settled: as many as it looks at."""
+        return self.config.planner.selection_length
+
+    def summary(self, group: str) -> SelectionSummary:
+        """The averages of a group."""
+        return summarise(self.episodes[group], self.window)
+
+    def by_physics(self, group: str) -> list[tuple[dict[str, float], SelectionSummary]]:
+        """The averages of each physics of a group, in ascending order."""
+        episodes = self.episodes[group]
+        return [
+            (
+                physics,
+                summarise([e for e in episodes if dict(e.sim_params) == physics], self.window),
+            )
+            for physics in distinct(episode.sim_params for episode in episodes)
+        ]
+
+
+def diagnose(
+    run_dir: str | Path,
+    *,
+    groups: Sequence[str] | None = None,
+    num_episodes: int | None = None,
+    collected: bool = False,
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Examine head selection and predicted variances on a run's own test episodes.
+
+    The episodes are run again with the run's protocol and fixed seeds; before every step, all
+    heads predict what it leads to. Nothing in the directory changes.
+
+    Args:
+        run_dir: The run directory.
+        groups: `train` or unseen groups; all of them by default.
+        num_episodes: Episodes per group; the run's own number by default.
+        collected: Take the episodes that the last iteration collected, instead of running tests.
+            That is done at once, but the model has learned from these episodes since.
+        progress: Shown while testing; silent by default.
+
+    Raises:
+        RunError: There is no trained run, or it is damaged.
+        UnknownNameError: No such group.
+        ConfigError: `collected` leaves no choice of groups and episodes.
+        LimitError: Planning needs more memory than is free.
+    """
+    if collected:
+        return _of_collected(run_dir, groups, num_episodes)
+    tested = run_tests(run_dir, groups=groups, num_episodes=num_episodes, progress=progress)
+    return _examined(Path(run_dir), tested.config, tested.agent, tested.trajectories)
+
+
+def _of_collected(
+    run_dir: str | Path, groups: Sequence[str] | None, num_episodes: int | None
+) -> Diagnosis:
+    if groups or num_episodes is not None:
+        raise ConfigError(
+            "groups or episodes are chosen together with `collected`, allowed: one of them; the"
+            " collected episodes are all of training physics."
+        )
+    run = RunDir(run_dir)
+    config = run.config()
+    agent = load_agent(run, config)
+    trajectories = {COLLECTED: run.iteration_data(run.finished_iterations - 1)}
+    return _examined(run.path, config, agent, trajectories)
+
+
+def _examined(
+    path: Path, config: Config, agent: Agent, trajectories: Mapping[str, list[Trajectory]]
+) -> Diagnosis:
+    key = jax.random.key(config.evaluation.seed)
+    episodes = {
+        group: examine(agent, found, key=jax.random.fold_in(key, i))
+        for i, (group, found) in enumerate(trajectories.items())
+    }
+    return Diagnosis(path, config, {group: found for group, found in episodes.items() if found})
+
+
+def facts(diagnosis: Diagnosis) -> Facts:
+    """The diagnosis as plain values, for JSON."""
+    return {
+        "run_dir": str(diagnosis.path),
+        "settled_after": diagnosis.window,
+        "groups": [
+            {
+                "group": group,
+                **_summary(diagnosis.summary(group)),
+                "physics": [
+                    {"sim_params": physics, **_summary(summary)}
+                    for physics, summary in diagnosis.by_physics(group)
+                ],
+            }
+            for group in diagnosis.episodes
+        ],
+    }
+
+
+def _summary(summary: SelectionSummary) -> Facts:
+    calibration = summary.calibration
+    return {
+        "episodes": summary.episodes,
+        "chosen_error": summary.chosen_error,
+        "best_error": summary.best_error,
+        "average_error": summary.average_error,
+        "regret": summary.regret,
+        "wrong_selections": summary.wrong,
+        "settling_steps": summary.settling,
+        "settled": summary.settled,
+        "head_errors": summary.head_errors.tolist(),
+        "calibration": None
+        if calibration is None
+        else {
+            "mean_square": calibration.mean_square,
+            "inside": {f"{level:g}": share for level, share in calibration.inside.items()},
+        },
+    }
+
+
+def tables(diagnosis: Diagnosis) -> list[Table]:
+    """Lay a diagnosis out: selection, errors of each head, calibration."""
+    made = [_selection(diagnosis), _heads(diagnosis)]
+    if any(diagnosis.summary(group).calibration for group in diagnosis.episodes):
+        made.append(_calibration(diagnosis))
+    return made
+
+
+def _selection(diagnosis: Diagnosis) -> Table:
+    table = new_table(f"Head selection: {diagnosis.path}", "physics")
+    for name in ("episodes", "chosen", "best", "average", "regret", "wrong", "settles", "settled"):
+        table.add_column(name, justify="right")
+    for name, summary, style in _lines(diagnosis):
+        table.add_row(
+            name,
+            str(summary.episodes),
+            f"{summary.chosen_error:.3g}",
+            f"{summary.best_error:.3g}",
+            f"{summary.average_error:.3g}",
+            _relative(summary),
+            f"{summary.wrong:.0%}",
+            "never" if summary.settling is None else f"{summary.settling:g}",
+            f"{summary.settled:.0%}",
+            style=style,
+        )
+    table.caption = (
+        "errors: mean squares in normalised units, of the chosen head, the best one of each episode"
+        " in hindsight, and all heads; regret: chosen above best; wrong: chosen is not the best;"
+        f" settles: transitions seen before the best is chosen {diagnosis.window} times in a row"
+        " (median); settled: share of episodes and members where that happens"
+    )
+    if diagnosis.config.planner.head_selection == "average":
+        table.caption += ". This run plans with the average; chosen is what it would select."
+    return table
+
+
+def _relative(summary: SelectionSummary) -> str:
+    if summary.best_error <= 0:
+        return "–"
+    return f"{summary.regret / summary.best_error:+.1%}"
+
+
+def _heads(diagnosis: Diagnosis) -> Table:
+    table = new_table("Error of each head", "physics", "member")
+    summaries = {group: diagnosis.summary(group) for group in diagnosis.episodes}
+    heads = max((s.head_errors.shape[1] for s in summaries.values()), default=0)
+    for head in range(heads):
+        table.add_column(f"head {head}", justify="right")
+    for group, summary in summaries.items():
+        for member, errors in enumerate(summary.head_errors):
+            best = int(errors.argmin())
+            cells = [
+                f"[bold]{error:.3g}[/bold]" if head == best else f"{error:.3g}"
+                for head, error in enumerate(errors)
+            ]
+            table.add_row("" if member else _group(group), str(member), *cells)
+        table.add_section()
+    table.caption = "mean squares in normalised units; bold: the member's best head on the group"
+    return table
+
+
+def _calibration(diagnosis: Diagnosis) -> Table:
+    table = new_table("Calibration of the predicted variance, chosen heads", "physics")
+    table.add_column("mean square", justify="right")
+    for level in LEVELS:
+        table.add_column(f"inside {level:.0%}", justify="right")
+    for name, summary, style in _lines(diagnosis):
+        if summary.calibration is not None:
+            shares = [f"{summary.calibration.inside[level]:.1%}" for level in LEVELS]
+            table.add_row(name, f"{summary.calibration.mean_square:.3g}", *shares, style=style)
+    table.caption = (
+        "mean square: of the error in predicted standard deviations; 1 is right, more is too sure."
+        " inside: share of the truth within the central interval of that level"
+    )
+    return table
+
+
+def _lines(diagnosis: Diagnosis) -> list[tuple[str, SelectionSummary, str]]:
+    """A line per group, then one per physics: name, averages, style."""
+    lines = []
+    everything = [e.sim_params for episodes in diagnosis.episodes.values() for e in episodes]
+    names = varying(everything) if everything else []
+    for group in diagnosis.episodes:
+        lines.append((_group(group), diagnosis.summary(group), "bold"))
+        for physics, summary in diagnosis.by_physics(group):
+            lines.append((f"  {full_label(physics, names)}", summary, ""))
+    return lines
+
+
+def _group(group: str) -> str:
+    names = {"train": "training", "unseen": "unseen", COLLECTED: "training, collected"}
+    return names.get(group, f"unseen: {group}")
