@@ -65,7 +65,7 @@ def setting_names(config: Config) -> list[str]:
 
 def differences(old: Config, new: Config) -> list[str]:
     """Return one line per setting that differs, for people to read."""
-    before, after = _flatten(to_dict(old)), _flatten(to_dict(new))
+    before, after = flatten(to_dict(old)), flatten(to_dict(new))
     return [
         f"{name}: {shown(before.get(name))} -> {shown(after.get(name))}"
         for name in sorted({*before, *after})
@@ -84,11 +84,12 @@ def unknown_setting(name: str, known: list[str]) -> str:
     return f"unknown setting {name!r}.{hint} `headway train ENV --help` lists all settings."
 
 
-def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The values of nested tables by dotted name."""
     flat = {}
     for name, value in values.items():
         if isinstance(value, Mapping) and value:
-            flat |= _flatten(value, f"{prefix}{name}.")
+            flat |= flatten(value, f"{prefix}{name}.")
         else:
             flat[prefix + name] = list(value) if isinstance(value, tuple) else value
     return flat

@@ -61,7 +61,7 @@ def evaluation(rows: Sequence[EpisodeRow], title: str) -> Table:
     """Lay out the returns of test episodes: a line per group, then one per physics."""
     parts, groups = by_physics(rows), by_group(rows)
     with_score = any(part["score"] is not None for part in parts)
-    table = _table(title, "physics")
+    table = new_table(title, "physics")
     for name in ("episodes", "return", *["score"] * with_score):
         table.add_column(name, justify="right")
     names = varying([row.sim_params for row in rows]) if rows else []
@@ -84,7 +84,7 @@ def evaluation(rows: Sequence[EpisodeRow], title: str) -> Table:
 def envs() -> tuple[list[Facts], Table]:
     """Describe every environment."""
     specs = [env_spec(name) for name in env_names()]
-    table = _table("Environments", "name", "what varies", "training", "unseen")
+    table = new_table("Environments", "name", "what varies", "training", "unseen")
     for name in ("obs", "action", "steps"):
         table.add_column(name, justify="right")
     table.add_column("options", overflow="fold")
@@ -111,7 +111,7 @@ def envs() -> tuple[list[Facts], Table]:
 
 def methods() -> tuple[list[Facts], Table]:
     """Describe every method."""
-    table = _table("Methods", "name", "description", "settings that differ from tmcl")
+    table = new_table("Methods", "name", "description", "settings that differ from tmcl")
     entries = []
     for method in METHODS.values():
         entries.append(
@@ -127,7 +127,7 @@ def methods() -> tuple[list[Facts], Table]:
 
 def presets() -> tuple[list[Facts], Table]:
     """Describe every preset."""
-    table = _table("Presets", "name", "description")
+    table = new_table("Presets", "name", "description")
     entries = []
     for preset in PRESETS.values():
         entries.append({"name": preset.name, "description": preset.description})
@@ -174,7 +174,8 @@ def _settings(settings: Mapping[str, Any]) -> str:
     return "\n".join(f"{name} {value}" for name, value in settings.items()) or "–"
 
 
-def _table(title: str, *columns: str) -> Table:
+def new_table(title: str, *columns: str) -> Table:
+    """An empty table in the look of all others."""
     table = Table(
         *columns, title=title, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD
     )

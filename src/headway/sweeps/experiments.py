@@ -60,12 +60,21 @@ class Experiment:
 _CONTEXT_OFF: Settings = {"model.context_size": 0, "model.backward_net": False}
 _TMCL = Arm("T-MCL")
 _MCL = Arm("MCL", "mcl")
-_LABELS = {
+_LABELS = {  # a method that is not named here stands under its own name
     "tmcl": "T-MCL",
     "mcl": "MCL",
     "pets": "PETS",
     "mh-pets": "Multi-Headed PETS",
     "vanilla": "Vanilla",
+    "stacked": "Stacked",
+    "cadm": "Vanilla + CaDM",
+    "pets-cadm": "PETS + CaDM",
+    "grbal": "GrBAL",
+    "rebal": "ReBAL",
+    "ria": "RIA",
+    "oracle-params": "Oracle parameters",
+    "true-dynamics": "True dynamics",
+    "random": "Random",
 }
 
 

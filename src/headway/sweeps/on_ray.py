@@ -8,6 +8,7 @@ the directory keeps out what is left of a lost task, and other drivers.
 import contextlib
 import dataclasses
 import json
+import logging
 import math
 import os
 import time
@@ -56,9 +57,9 @@ def _connected(address: str | None) -> Iterator[None]:
         yield
         return
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    alone = {} if address else {"include_dashboard": False}
+    alone: dict[str, Any] = {} if address else {"include_dashboard": False}
     try:
-        ray.init(address or "local", logging_level="ERROR", log_to_driver=False, **alone)
+        ray.init(address or "local", logging_level=logging.ERROR, log_to_driver=False, **alone)
     except (ConnectionError, ValueError) as error:
         raise ConfigError(
             f"there is no Ray cluster at address {address!r} ({error}); start one with `ray start"
@@ -131,7 +132,7 @@ class _Dispatcher:
         self._task = ray.remote(**options)(_work)
         here = ray.get_runtime_context().get_node_id()
         stays = NodeAffinitySchedulingStrategy(here, soft=False)
-        self._mailbox = _Mailbox.options(scheduling_strategy=stays).remote()  # pyright: ignore
+        self._mailbox: Any = _Mailbox.options(scheduling_strategy=stays).remote()  # pyright: ignore
         self._waiting = [(0.0, job) for job in jobs]
         self._running: dict[Any, Job] = {}
         self._losses = {job.path: (0, 0) for job in jobs}
@@ -170,7 +171,8 @@ class _Dispatcher:
 
     def _read_reports(self) -> None:
         by_path = {str(job.path.absolute()): job for job in self._running.values()}
-        for path, report in ray.get(self._mailbox.take.remote()).items():
+        reports: Any = ray.get(self._mailbox.take.remote())
+        for path, report in reports.items():
             if path in by_path:
                 self._board.tell(by_path[path], Status(**report))
 
@@ -185,7 +187,8 @@ class _Dispatcher:
     def _end_of(self, task: Any, job: Job) -> Status:
         reached = first_status(job).iteration
         try:
-            return Status(**ray.get(task))
+            ended: Any = ray.get(task)
+            return Status(**ended)
         except RayTaskError as error:
             cause = error.cause if isinstance(error.cause, Exception) else error
             return Status("failed", reached, note=f"{type(cause).__name__}: {cause}")
