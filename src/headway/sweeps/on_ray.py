@@ -45,8 +45,8 @@ def run_on_ray(jobs: Sequence[Job], workers: Workers, board: Board) -> None:
         ConfigError: No node is large enough for one run, or there is no such cluster.
     """
     with _connected(workers.address):
-        options = _task_options(workers)
-        with _Dispatcher(jobs, board, options) as dispatcher:
+        task = ray.remote(**_task_options(workers))(_work)
+        with _Dispatcher(jobs, board, task, _mailbox_here()) as dispatcher:
             dispatcher.run()
 
 
@@ -117,6 +117,13 @@ class _Mailbox:
         return found
 
 
+def _mailbox_here() -> Any:
+    """A mailbox on the driver's own node, so that no other node's end loses reports."""
+    here = ray.get_runtime_context().get_node_id()
+    stays = NodeAffinitySchedulingStrategy(here, soft=False)
+    return _Mailbox.options(scheduling_strategy=stays).remote()  # pyright: ignore
+
+
 def _work(config: str, path: str, mailbox: Any) -> dict[str, Any]:
     """Train a run in a worker's process; a task takes and returns plain values only."""
     job = Job(settings.from_dict(json.loads(config)), Path(path))
@@ -127,12 +134,8 @@ def _work(config: str, path: str, mailbox: Any) -> dict[str, Any]:
 class _Dispatcher:
     """Submits tasks, reads their reports, and submits those again that were lost."""
 
-    def __init__(self, jobs: Sequence[Job], board: Board, options: dict[str, Any]):
-        self._board = board
-        self._task = ray.remote(**options)(_work)
-        here = ray.get_runtime_context().get_node_id()
-        stays = NodeAffinitySchedulingStrategy(here, soft=False)
-        self._mailbox: Any = _Mailbox.options(scheduling_strategy=stays).remote()  # pyright: ignore
+    def __init__(self, jobs: Sequence[Job], board: Board, task: Any, mailbox: Any):
+        self._board, self._task, self._mailbox = board, task, mailbox
         self._waiting = [(0.0, job) for job in jobs]
         self._running: dict[Any, Job] = {}
         self._losses = {job.path: (0, 0) for job in jobs}
