@@ -94,8 +94,11 @@ def is_held(path):
         return False
 
 
-@pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGINT])
-def test_a_driver_that_is_stopped_goes_on_when_it_is_begun_again(tmp_path, signal_number):
+@pytest.mark.parametrize(
+    ("signal_number", "code"),
+    [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130), (signal.SIGTERM, 143)],
+)
+def test_a_driver_that_is_stopped_goes_on_when_it_is_begun_again(tmp_path, signal_number, code):
     jobs = [fakes.tiny_job(tmp_path, seed, **LONGER) for seed in (0, 1)]
     first = tmp_path / "first.log"
     with first.open("w") as log:
@@ -104,7 +107,7 @@ def test_a_driver_that_is_stopped_goes_on_when_it_is_begun_again(tmp_path, signa
         assert driver.poll() is None, first.read_text()
         driver.send_signal(signal_number)
         driver.wait(60)
-    assert driver.returncode == (130 if signal_number == signal.SIGINT else -signal.SIGKILL)
+    assert driver.returncode == code, first.read_text()
     written = {job.path: first_written(job.path) for job in jobs if job.finished_iterations}
     assert written
     assert not all(job.finished for job in jobs)

@@ -22,6 +22,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from headway import settings
 from headway.errors import ConfigError
+from headway.experiment.interrupts import stop_requests
 from headway.sweeps.board import Board, first_status
 from headway.sweeps.jobs import Job
 from headway.sweeps.running import PATIENCE, Workers, make_run
@@ -152,17 +153,23 @@ class _Dispatcher:
         ray.kill(self._mailbox)
 
     def run(self) -> None:
-        """Go on until every job is over."""
-        while self._waiting or self._running:
-            self._submit()
-            if self._running:
-                ended, _ = ray.wait(list(self._running), timeout=POLL)
-            else:
-                ended = []
-                time.sleep(POLL)
-            self._read_reports()
-            for task in ended:
-                self._settle(task)
+        """Go on until every job is over, or a signal asks to stop."""
+        with stop_requests() as stop:
+            while self._waiting or self._running:
+                self._submit()
+                for task in self._ended():
+                    self._settle(task)
+                stop.answer()
+
+    def _ended(self) -> Sequence[Any]:
+        """Wait a moment, read the reports, and say which tasks are over."""
+        ended: Sequence[Any] = []
+        if self._running:
+            ended, _ = ray.wait(list(self._running), timeout=POLL)
+        else:
+            time.sleep(POLL)
+        self._read_reports()
+        return ended
 
     def _submit(self) -> None:
         now = time.monotonic()
