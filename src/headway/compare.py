@@ -4,8 +4,9 @@ import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
-from headway.report.comparison import Found, find, write_raw, write_table
+from headway.report.comparison import write_raw, write_table
 from headway.report.comparison_figure import draw_comparison
+from headway.report.comparison_runs import Found, find
 from headway.sweeps.board import Board
 from headway.sweeps.jobs import Comparison
 from headway.sweeps.running import Workers, run_jobs

@@ -13,8 +13,10 @@ from headway.cli import main
 from headway.cli.comparisons import read_seeds, read_settings
 from headway.cli.usage import UsageError
 from headway.compare import reproduce
-from headway.report.comparison import find, spread
+from headway.report.comparison import spread
 from headway.report.comparison_figure import arm_styles, has_curves
+from headway.report.comparison_runs import find
+from headway.report.comparison_statistics import verdicts
 from headway.sweeps import running
 from headway.sweeps.experiments import EXPERIMENTS, experiment
 from headway.sweeps.jobs import Comparison
@@ -59,10 +61,15 @@ def test_files_stand_beside_each_other_and_hold_what_the_runs_say(training, tmp_
     assert np.mean(unseen) == 30 + 2 + 1  # see fakes.level
     assert all((tmp_path / row["run"] / "config.json").exists() for row in rows)
     table = (folder / "fig13.md").read_text()
-    assert "| MCL | 3 | 32.0 ± 1.0 | 132.0 ± 1.0 | – |" in table
-    assert "| T-MCL | 3 | 42.0 ± 1.0 | 142.0 ± 1.0 | – |" in table
+    spread_of_three = r"32.0 \(3[1-3][.\d]* to 3[1-3][.\d]*\)"
+    assert re.search(
+        rf"\| MCL \| 3 \| 32.0 ± 1.0 \| {spread_of_three} \| 132.0 ± 1.0 \| – \|", table
+    )
+    assert "| T-MCL | 3 | 42.0 ± 1.0 | 42.0 (4" in table
+    # All of T-MCL's runs are above all of MCL's.
+    assert "- T-MCL is better than MCL (probability of improvement 1.00, 1.00 to 1.00" in table
     assert "    headway reproduce fig13\n" in table
-    assert "can be claimed" not in table
+    assert "no difference between arms can be claimed" not in table
 
 
 def test_figures_have_ink_and_svg_names_the_arms(training, tmp_path):
@@ -101,9 +108,19 @@ def test_few_seeds_and_missing_runs_are_said(training, tmp_path):
     assert len(done.failures) == 1
     assert [tuple(cell) for cell in done.found.missing] == [("pendulum", "MCL", 1)]
     table = (tmp_path / "fig13-smoke/fig13.md").read_text()
+    assert "is better than" not in table
     assert "Fewer than 3 seeds: no difference between arms can be claimed." in table
     assert "Not finished: pendulum, MCL, seed 1." in table
-    assert "| MCL | 1 | 31.0 | 131.0 | – |" in table
+    assert "| MCL | 1 | 31.0 | – | 131.0 | – |" in table
+
+
+def test_arms_are_compared_over_groups_and_environments_of_both(training, tmp_path):
+    training.answers = {0: [fakes.DIVERGED]}
+    done = reproduce(comparison(tmp_path, envs=("pendulum", "half-cheetah")), workers=HERE)
+    assert [tuple(cell) for cell in done.found.missing] == [("pendulum", "MCL", 0)]
+    assert done.found.group_returns("pendulum", "MCL") == {"low": [32, 33], "high": [32, 33]}
+    (line,) = verdicts(done.found)
+    assert line.startswith("2 seeds: too few to claim that T-MCL and MCL differ")
 
 
 def test_another_figure_reuses_the_runs(training, tmp_path):
@@ -142,7 +159,7 @@ def test_reproduce_on_the_command_line(training, tmp_path, capsys):
     words = ("reproduce", "fig13", *WORDS, "--seeds", "0:2", "--out", str(tmp_path))
     code, out, _ = run(capsys, *words)
     assert code == 0
-    assert re.search(r"T-MCL +2 +41.5 ± 0.7 +141.5 ± 0.7", out)
+    assert re.search(r"T-MCL +2 +41.5 ± 0.7 +– +141.5 ± 0.7", out)
     assert "headway reproduce fig13 --envs pendulum --preset smoke" in out
     code, out, _ = run(capsys, *words, "--json")
     facts = json.loads(out)

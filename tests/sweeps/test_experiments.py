@@ -139,6 +139,12 @@ def test_what_is_asked_twice_or_unknown_is_refused(tmp_path):
         experiment("figg13")
 
 
+def test_references_are_arms():
+    for found in EXPERIMENTS.values():
+        assert found.reference_arm.label == (found.reference or found.arms[0].label)
+        assert found.reference_arm in found.arms
+
+
 def test_values_of_settings_are_plain():
     for found in EXPERIMENTS.values():
         for arm in found.arms:

@@ -1,131 +1,22 @@
 """What an experiment found: raw numbers as CSV, a table as Markdown, beside the figure."""
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from headway.experiment import files, storage
 from headway.experiment.runs import RunDir
-from headway.experiment.tables import format_sim_params
+from headway.report.comparison_runs import COLLECTED, Found
+from headway.report.comparison_statistics import interquartile, verdicts
+from headway.report.statistics import MIN_RUNS
 from headway.report.tables import by_group
-from headway.sweeps.board import first_status
-from headway.sweeps.jobs import Cell, Comparison, Job
 
 RAW_COLUMNS = (
     "experiment", "arm", "env", "method", "preset", "seed", "iteration", "timesteps", "group",
     "sim_params", "episode", "return", "run",
 )  # fmt: skip
-COLLECTED = "collected"
-MIN_SEEDS = 3
-
-Row = dict[str, Any]
-
-
-class Point(NamedTuple):
-    """The mean return of one run after one iteration."""
-
-    env: str
-    arm: str
-    seed: int
-    iteration: int
-    timesteps: int
-    value: float
-
-
-@dataclasses.dataclass(frozen=True)
-class Found:
-    """What the finished runs of a comparison measured."""
-
-    comparison: Comparison
-    rows: list[Row]
-    """Every episode, as in the CSV."""
-    points: list[Point]
-    """Mean return of every run and tested iteration, over the episodes that are measured."""
-    missing: list[Cell]
-    """Places of the table whose run is not finished."""
-
-    def of(self, env: str, arm: str) -> list[Point]:
-        """The points of one arm in one environment."""
-        return [point for point in self.points if (point.env, point.arm) == (env, arm)]
-
-    def last(self, env: str, arm: str) -> list[Point]:
-        """The same after the last iteration: one per seed."""
-        points = self.of(env, arm)
-        final = max((point.iteration for point in points), default=0)
-        return [point for point in points if point.iteration == final]
-
-    @property
-    def final_points(self) -> list[Point]:
-        """The points after the last iteration, of every environment and arm."""
-        comparison = self.comparison
-        arms = comparison.experiment.arms
-        return [p for env in comparison.envs for arm in arms for p in self.last(env, arm.label)]
-
-
-def find(comparison: Comparison) -> Found:
-    """Read the finished runs of a comparison; a damaged one counts as missing."""
-    rows, points, missing = [], [], []
-    for cell, job in comparison.cells.items():
-        if first_status(job).state != "done":
-            missing.append(cell)
-            continue
-        measured = _episodes(comparison, cell, job)
-        rows += measured
-        points += _points(comparison, cell, measured)
-    return Found(comparison, rows, points, missing)
-
-
-def _episodes(comparison: Comparison, cell: Cell, job: Job) -> list[Row]:
-    """Every episode of a run that the experiment looks at."""
-    run = RunDir(job.path)
-    metrics = run.metrics()
-    common = {
-        "experiment": comparison.experiment.name,
-        "arm": cell.arm,
-        "env": cell.env,
-        "method": job.config.method,
-        "preset": job.config.preset,
-        "seed": cell.seed,
-        "run": job.path.relative_to(comparison.out).as_posix(),
-    }
-    if comparison.experiment.measure == COLLECTED:
-        return [
-            {
-                **common,
-                "iteration": line["iteration"],
-                "timesteps": line["timesteps"],
-                "group": COLLECTED,
-                "sim_params": "",
-                "episode": episode,
-                "return": value,
-            }
-            for line in metrics
-            for episode, value in enumerate(line["collection"]["returns"])
-        ]
-    return [
-        {
-            **common,
-            "iteration": row.iteration,
-            "timesteps": metrics[row.iteration]["timesteps"],
-            "group": row.group,
-            "sim_params": format_sim_params(row.sim_params),
-            "episode": row.episode,
-            "return": row.episode_return,
-        }
-        for row in run.evaluation()
-    ]
-
-
-def _points(comparison: Comparison, cell: Cell, rows: Sequence[Row]) -> list[Point]:
-    """The mean of every iteration; training physics do not count as unseen ones."""
-    measured = [row for row in rows if row["group"] != "train"]
-    returns: dict[tuple[int, int], list[float]] = {}
-    for row in measured:
-        returns.setdefault((row["iteration"], row["timesteps"]), []).append(row["return"])
-    return [Point(*cell[:2], cell.seed, *when, float(np.mean(r))) for when, r in returns.items()]
+IQM = "interquartile mean (95 %)"
 
 
 def write_raw(found: Found) -> Path:
@@ -140,14 +31,17 @@ def write_table(found: Found, command: str) -> Path:
 
     Args:
         found: What the runs measured.
-        command: The command that makes it all again.
+        command: The command that makes it all again; may be empty.
     """
     comparison = found.comparison
     experiment = comparison.experiment
     lines = [f"# {experiment.name}: {experiment.title}", "", *_about(found), ""]
     for env in comparison.envs:
         lines += [f"## {env}", "", *_markdown(table_columns(found), table_rows(found, env)), ""]
-    lines += ["The command, which resumes what was interrupted:", "", f"    {command}", ""]
+    if len(comparison.seeds) >= MIN_RUNS:
+        lines += ["## What can be claimed", "", *(f"- {line}" for line in verdicts(found)), ""]
+    if command:
+        lines += ["The command, which resumes what was interrupted:", "", f"    {command}", ""]
     path = comparison.folder / f"{experiment.name}.md"
     files.write_bytes(path, "\n".join(lines).encode())
     return path
@@ -156,8 +50,8 @@ def write_table(found: Found, command: str) -> Path:
 def table_columns(found: Found) -> list[str]:
     """The headings of the table."""
     if found.comparison.experiment.measure == COLLECTED:
-        return ["arm", "seeds", "return while collecting"]
-    return ["arm", "seeds", "return on unseen physics", "on training physics", "score, unseen"]
+        return ["arm", "seeds", "return while collecting", IQM]
+    return ["arm", "seeds", "return on unseen physics", IQM, "on training physics", "score"]
 
 
 def table_rows(found: Found, env: str) -> list[list[str]]:
@@ -167,6 +61,7 @@ def table_rows(found: Found, env: str) -> list[list[str]]:
     for arm in found.comparison.experiment.arms:
         points = found.last(env, arm.label)
         line = [arm.label, str(len(points)), spread([point.value for point in points])]
+        line.append(interquartile(found, env, arm.label))
         if not collected:
             line += _training_and_score(found, env, arm.label)
         lines.append(line)
@@ -202,11 +97,12 @@ def _about(found: Found) -> list[str]:
     changed = "".join(f", {name} {value}" for name, value in comparison.settings.items())
     lines = [
         f"Preset `{comparison.preset}`{changed}, seeds {seeds}. Mean ± standard deviation over"
-        " seeds after the last iteration; a score of 0 is random, 1 the planner on the true"
+        " seeds after the last iteration; interquartile mean with its 95 % stratified bootstrap"
+        " interval. The score is that on unseen physics: 0 is random, 1 the planner on the true"
         " dynamics.",
     ]
-    if len(comparison.seeds) < MIN_SEEDS:
-        lines.append(f"Fewer than {MIN_SEEDS} seeds: no difference between arms can be claimed.")
+    if len(comparison.seeds) < MIN_RUNS:
+        lines.append(f"Fewer than {MIN_RUNS} seeds: no difference between arms can be claimed.")
     if found.missing:
         names = "; ".join(f"{cell.env}, {cell.arm}, seed {cell.seed}" for cell in found.missing)
         lines.append(f"Not finished: {names}.")

@@ -2,17 +2,19 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from headway.report.comparison import COLLECTED, Found, Point
+from headway.report.comparison_runs import COLLECTED, Found, Point
 from headway.report.style import FAINT, HEADS, INK, figure, label_axis, legend
 
 COLUMNS = 3
-_STYLES = ("-", "--", ":")
+LineStyle = Literal["-", "--", ":"]
+_STYLES: tuple[LineStyle, ...] = ("-", "--", ":")
 
 
 def draw_comparison(found: Found) -> list[Path]:
@@ -48,7 +50,7 @@ def has_curves(found: Found) -> bool:
     return len({point.iteration for point in found.points}) > 1
 
 
-def arm_styles(labels: Sequence[str]) -> dict[str, tuple[str, str]]:
+def arm_styles(labels: Sequence[str]) -> dict[str, tuple[str, LineStyle]]:
     """A colour and a line style per arm; colours repeat with another style."""
     return {
         label: (HEADS[i % len(HEADS)], _STYLES[i // len(HEADS) % len(_STYLES)])

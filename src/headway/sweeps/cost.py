@@ -103,10 +103,10 @@ def _measured_speed(job: Job) -> float:
 def _matrix_rate() -> float:
     """Operations per second of this machine's matrix products in float32."""
     matrix = np.ones((_SIZE, _SIZE), np.float32)
-    matrix @ matrix  # the first one starts threads
+    np.matmul(matrix, matrix)  # the first one starts threads
     fastest = float("inf")
     for _ in range(_PRODUCTS):
         begin = time.perf_counter()
-        matrix @ matrix
+        np.matmul(matrix, matrix)
         fastest = min(fastest, time.perf_counter() - begin)
     return 2 * _SIZE**3 / fastest

@@ -45,19 +45,36 @@ class Experiment:
     """What is compared."""
     arms: tuple[Arm, ...]
     """What is compared, in the order of the figure."""
+    reference: str = ""
+    """Label of the arm that the others are compared with; the first one by default."""
     measure: Measure = "unseen"
     """Returns on unseen physics, or those of the episodes collected for training."""
+
+    @property
+    def reference_arm(self) -> Arm:
+        """The arm that the others are compared with."""
+        found = [arm for arm in self.arms if arm.label == self.reference]
+        return found[0] if found else self.arms[0]
 
 
 _CONTEXT_OFF: Settings = {"model.context_size": 0, "model.backward_net": False}
 _TMCL = Arm("T-MCL")
 _MCL = Arm("MCL", "mcl")
-_LABELS = {
+_LABELS = {  # a method that is not named here stands under its own name
     "tmcl": "T-MCL",
     "mcl": "MCL",
     "pets": "PETS",
     "mh-pets": "Multi-Headed PETS",
     "vanilla": "Vanilla",
+    "stacked": "Stacked",
+    "cadm": "Vanilla + CaDM",
+    "pets-cadm": "PETS + CaDM",
+    "grbal": "GrBAL",
+    "rebal": "ReBAL",
+    "ria": "RIA",
+    "oracle-params": "Oracle parameters",
+    "true-dynamics": "True dynamics",
+    "random": "Random",
 }
 
 
@@ -90,6 +107,7 @@ _EXPERIMENTS = (
         "fig10",
         "PETS with one head and with several",
         (Arm("PETS", "pets"), Arm("Multi-Headed PETS", "mh-pets")),
+        "Multi-Headed PETS",
     ),
     Experiment(
         "fig11",
@@ -101,21 +119,24 @@ _EXPERIMENTS = (
         "with and without context learning",
         (Arm("with context"), Arm("without context", settings=_CONTEXT_OFF)),
     ),
-    Experiment("fig13", "MCL and T-MCL", (_MCL, _TMCL)),
+    Experiment("fig13", "MCL and T-MCL", (_MCL, _TMCL), "T-MCL"),
     Experiment(
         "fig14",
         "number of prediction heads H",
         tuple(Arm(f"H = {heads}", settings={"model.num_heads": heads}) for heads in NUM_HEADS),
+        "H = 3",
     ),
     Experiment(
         "fig15",
         "segment length M of the oracle loss",
         tuple(_segments(length) for length in SEGMENT_LENGTHS),
+        "M = 10",
     ),
     Experiment(
         "fig16",
         "past transitions N that select a head",
         tuple(_past(length) for length in SELECTION_LENGTHS),
+        "N = 10",
     ),
     Experiment(
         "heads",

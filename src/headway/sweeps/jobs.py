@@ -144,10 +144,5 @@ def fingerprint(config: Config) -> str:
 
 def _lines(config: Config) -> set[str]:
     """Every setting as one line of text."""
-    lines = set()
-    for section, values in settings.to_dict(config).items():
-        named = {section: values}
-        if isinstance(values, dict) and section != "sim_params":
-            named = {f"{section}.{name}": value for name, value in values.items()}
-        lines |= {f"{name}={json.dumps(value, sort_keys=True)}" for name, value in named.items()}
-    return lines
+    flat = settings.flatten(settings.to_dict(config))
+    return {f"{name}={json.dumps(value)}" for name, value in flat.items()}

@@ -8,6 +8,7 @@ the directory keeps out what is left of a lost task, and other drivers.
 import contextlib
 import dataclasses
 import json
+import logging
 import math
 import os
 import time
@@ -21,6 +22,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from headway import settings
 from headway.errors import ConfigError
+from headway.experiment.interrupts import stop_requests
 from headway.sweeps.board import Board, first_status
 from headway.sweeps.jobs import Job
 from headway.sweeps.running import PATIENCE, Workers, make_run
@@ -44,8 +46,8 @@ def run_on_ray(jobs: Sequence[Job], workers: Workers, board: Board) -> None:
         ConfigError: No node is large enough for one run, or there is no such cluster.
     """
     with _connected(workers.address):
-        options = _task_options(workers)
-        with _Dispatcher(jobs, board, options) as dispatcher:
+        task = ray.remote(**_task_options(workers))(_work)
+        with _Dispatcher(jobs, board, task, _mailbox_here()) as dispatcher:
             dispatcher.run()
 
 
@@ -56,9 +58,9 @@ def _connected(address: str | None) -> Iterator[None]:
         yield
         return
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    alone = {} if address else {"include_dashboard": False}
+    alone: dict[str, Any] = {} if address else {"include_dashboard": False}
     try:
-        ray.init(address or "local", logging_level="ERROR", log_to_driver=False, **alone)
+        ray.init(address or "local", logging_level=logging.ERROR, log_to_driver=False, **alone)
     except (ConnectionError, ValueError) as error:
         raise ConfigError(
             f"there is no Ray cluster at address {address!r} ({error}); start one with `ray start"
@@ -116,6 +118,13 @@ class _Mailbox:
         return found
 
 
+def _mailbox_here() -> Any:
+    """A mailbox on the driver's own node, so that no other node's end loses reports."""
+    here = ray.get_runtime_context().get_node_id()
+    stays = NodeAffinitySchedulingStrategy(here, soft=False)
+    return _Mailbox.options(scheduling_strategy=stays).remote()  # pyright: ignore
+
+
 def _work(config: str, path: str, mailbox: Any) -> dict[str, Any]:
     """Train a run in a worker's process; a task takes and returns plain values only."""
     job = Job(settings.from_dict(json.loads(config)), Path(path))
@@ -126,12 +135,8 @@ def _work(config: str, path: str, mailbox: Any) -> dict[str, Any]:
 class _Dispatcher:
     """Submits tasks, reads their reports, and submits those again that were lost."""
 
-    def __init__(self, jobs: Sequence[Job], board: Board, options: dict[str, Any]):
-        self._board = board
-        self._task = ray.remote(**options)(_work)
-        here = ray.get_runtime_context().get_node_id()
-        stays = NodeAffinitySchedulingStrategy(here, soft=False)
-        self._mailbox = _Mailbox.options(scheduling_strategy=stays).remote()  # pyright: ignore
+    def __init__(self, jobs: Sequence[Job], board: Board, task: Any, mailbox: Any):
+        self._board, self._task, self._mailbox = board, task, mailbox
         self._waiting = [(0.0, job) for job in jobs]
         self._running: dict[Any, Job] = {}
         self._losses = {job.path: (0, 0) for job in jobs}
@@ -148,17 +153,23 @@ class _Dispatcher:
         ray.kill(self._mailbox)
 
     def run(self) -> None:
-        """Go on until every job is over."""
-        while self._waiting or self._running:
-            self._submit()
-            if self._running:
-                ended, _ = ray.wait(list(self._running), timeout=POLL)
-            else:
-                ended = []
-                time.sleep(POLL)
-            self._read_reports()
-            for task in ended:
-                self._settle(task)
+        """Go on until every job is over, or a signal asks to stop."""
+        with stop_requests() as stop:
+            while self._waiting or self._running:
+                self._submit()
+                for task in self._ended():
+                    self._settle(task)
+                stop.answer()
+
+    def _ended(self) -> Sequence[Any]:
+        """Wait a moment, read the reports, and say which tasks are over."""
+        ended: Sequence[Any] = []
+        if self._running:
+            ended, _ = ray.wait(list(self._running), timeout=POLL)
+        else:
+            time.sleep(POLL)
+        self._read_reports()
+        return ended
 
     def _submit(self) -> None:
         now = time.monotonic()
@@ -170,7 +181,8 @@ class _Dispatcher:
 
     def _read_reports(self) -> None:
         by_path = {str(job.path.absolute()): job for job in self._running.values()}
-        for path, report in ray.get(self._mailbox.take.remote()).items():
+        reports: Any = ray.get(self._mailbox.take.remote())
+        for path, report in reports.items():
             if path in by_path:
                 self._board.tell(by_path[path], Status(**report))
 
@@ -185,7 +197,8 @@ class _Dispatcher:
     def _end_of(self, task: Any, job: Job) -> Status:
         reached = first_status(job).iteration
         try:
-            return Status(**ray.get(task))
+            ended: Any = ray.get(task)
+            return Status(**ended)
         except RayTaskError as error:
             cause = error.cause if isinstance(error.cause, Exception) else error
             return Status("failed", reached, note=f"{type(cause).__name__}: {cause}")

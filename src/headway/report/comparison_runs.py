@@ -1,0 +1,134 @@
+"""What the finished runs of an experiment measured."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from headway.experiment.runs import RunDir
+from headway.experiment.tables import format_sim_params
+from headway.sweeps.board import first_status
+from headway.sweeps.jobs import Cell, Comparison, Job
+
+COLLECTED = "collected"
+
+Row = dict[str, Any]
+
+
+class Point(NamedTuple):
+    """The mean return of one run after one iteration."""
+
+    env: str
+    arm: str
+    seed: int
+    iteration: int
+    timesteps: int
+    value: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """What the finished runs of a comparison measured."""
+
+    comparison: Comparison
+    rows: list[Row]
+    """Every episode, as in the CSV."""
+    points: list[Point]
+    """Mean return of every run and tested iteration, over the episodes that are measured."""
+    missing: list[Cell]
+    """Places of the table whose run is not finished."""
+
+    def of(self, env: str, arm: str) -> list[Point]:
+        """The points of one arm in one environment."""
+        return [point for point in self.points if (point.env, point.arm) == (env, arm)]
+
+    def last(self, env: str, arm: str) -> list[Point]:
+        """The same after the last iteration: one per seed."""
+        points = self.of(env, arm)
+        final = max((point.iteration for point in points), default=0)
+        return [point for point in points if point.iteration == final]
+
+    def group_returns(self, env: str, arm: str) -> dict[str, list[float]]:
+        """Mean return of each group after the last iteration, one per seed; not of training."""
+        final = {(point.seed, point.iteration) for point in self.last(env, arm)}
+        returns: dict[str, dict[int, list[float]]] = {}
+        for row in self.rows:
+            wanted = (row["env"], row["arm"]) == (env, arm) and row["group"] != "train"
+            if wanted and (row["seed"], row["iteration"]) in final:
+                by_seed = returns.setdefault(row["group"], {})
+                by_seed.setdefault(row["seed"], []).append(row["return"])
+        return {
+            group: [float(np.mean(values)) for values in by_seed.values()]
+            for group, by_seed in returns.items()
+        }
+
+    @property
+    def final_points(self) -> list[Point]:
+        """The points after the last iteration, of every environment and arm."""
+        comparison = self.comparison
+        arms = comparison.experiment.arms
+        return [p for env in comparison.envs for arm in arms for p in self.last(env, arm.label)]
+
+
+def find(comparison: Comparison) -> Found:
+    """Read the finished runs of a comparison; a damaged one counts as missing."""
+    rows, points, missing = [], [], []
+    for cell, job in comparison.cells.items():
+        if first_status(job).state != "done":
+            missing.append(cell)
+            continue
+        measured = _episodes(comparison, cell, job)
+        rows += measured
+        points += _points(comparison, cell, measured)
+    return Found(comparison, rows, points, missing)
+
+
+def _episodes(comparison: Comparison, cell: Cell, job: Job) -> list[Row]:
+    """Every episode of a run that the experiment looks at."""
+    run = RunDir(job.path)
+    metrics = run.metrics()
+    common = {
+        "experiment": comparison.experiment.name,
+        "arm": cell.arm,
+        "env": cell.env,
+        "method": job.config.method,
+        "preset": job.config.preset,
+        "seed": cell.seed,
+        "run": job.path.relative_to(comparison.out).as_posix(),
+    }
+    if comparison.experiment.measure == COLLECTED:
+        return [
+            {
+                **common,
+                "iteration": line["iteration"],
+                "timesteps": line["timesteps"],
+                "group": COLLECTED,
+                "sim_params": "",
+                "episode": episode,
+                "return": value,
+            }
+            for line in metrics
+            for episode, value in enumerate(line["collection"]["returns"])
+        ]
+    return [
+        {
+            **common,
+            "iteration": row.iteration,
+            "timesteps": metrics[row.iteration]["timesteps"],
+            "group": row.group,
+            "sim_params": format_sim_params(row.sim_params),
+            "episode": row.episode,
+            "return": row.episode_return,
+        }
+        for row in run.evaluation()
+    ]
+
+
+def _points(comparison: Comparison, cell: Cell, rows: Sequence[Row]) -> list[Point]:
+    """The mean of every iteration; training physics do not count as unseen ones."""
+    measured = [row for row in rows if row["group"] != "train"]
+    returns: dict[tuple[int, int], list[float]] = {}
+    for row in measured:
+        returns.setdefault((row["iteration"], row["timesteps"]), []).append(row["return"])
+    return [Point(*cell[:2], cell.seed, *when, float(np.mean(r))) for when, r in returns.items()]
