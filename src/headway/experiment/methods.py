@@ -36,8 +36,20 @@ class Preset:
 
 _NO_CONTEXT: Settings = {"model.context_size": 0, "model.backward_net": False}
 
+_PETS: Settings = {
+    **_NO_CONTEXT,
+    "model.num_heads": 1,
+    "fitting.oracle": "independent",
+    "fitting.future_length": 1,
+}
+
 _METHODS = (
     Method("tmcl", "trajectory-wise multiple choice learning (the paper's method)", {}),
+    Method(
+        "tmcl-bayes",
+        "T-MCL whose heads keep learning while they act: a Bayesian last layer",
+        {"planner.adaptation": "last-layer"},
+    ),
     Method(
         "mcl",
         "multiple choice learning: heads compete for single transitions (Fig. 13)",
@@ -46,12 +58,12 @@ _METHODS = (
     Method(
         "pets",
         "ensemble of single-headed probabilistic networks, no context (Chua et al., 2018)",
-        {
-            **_NO_CONTEXT,
-            "model.num_heads": 1,
-            "fitting.oracle": "independent",
-            "fitting.future_length": 1,
-        },
+        _PETS,
+    ),
+    Method(
+        "pets-bayes",
+        "PETS whose head keeps learning while it acts: a Bayesian last layer",
+        {**_PETS, "planner.adaptation": "last-layer"},
     ),
     Method(
         "mh-pets",

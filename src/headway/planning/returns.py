@@ -23,6 +23,8 @@ class RolloutSettings:
     """Whether all candidates of a step share the noise of their particles."""
     released_reward: bool = False
     """Whether to plan with the released code's reward."""
+    risk_aversion: float = 0.0
+    """Standard deviations over the particles that are taken off the mean return."""
 
     @classmethod
     def of(cls, planner: PlannerConfig, num_members: int) -> "RolloutSettings":
@@ -31,6 +33,7 @@ class RolloutSettings:
             planner.num_particles // num_members,
             planner.particle_noise == "shared",
             planner.reward == "released",
+            planner.risk_aversion,
         )
 
 
@@ -118,7 +121,9 @@ def _environment_returns(
     start = jnp.broadcast_to(obs[:, None, None], (members, obs.shape[0], *rows[1:]))
     carry = spread_candidates(start), jnp.ones(rows, bool), jnp.zeros(rows)
     (_, _, total), _ = jax.lax.scan(imagine, carry, (candidates.transpose(1, 2, 0), noise))
-    return total.mean((0, 1))
+    if not settings.risk_aversion:
+        return total.mean((0, 1))
+    return total.mean((0, 1)) - settings.risk_aversion * total.std((0, 1))
 
 
 def imagine_step(
