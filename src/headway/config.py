@@ -15,7 +15,7 @@ from headway.sim_params import SimParamSets
 
 Oracle = Literal["independent", "transition", "trajectory"]
 OptimizerName = Literal["cem", "icem", "mppi", "random-shooting"]
-HeadSelection = Literal["adaptive", "average", "random"]
+HeadSelection = Literal["adaptive", "average", "random", "evidence", "evidence-sampled"]
 ModelKind = Literal["multi-headed", "gradient-adapted", "recurrent", "simulator", "none"]
 ContextKind = Literal["learned", "history", "sim-params"]
 ContextPlace = Literal["input", "last-hidden", "head"]
@@ -252,12 +252,14 @@ class PlannerConfig:
     """Which devices share the candidates: those of this process, or of all processes that
     `jax.distributed` joins, which must then all act alike, step by step."""
     head_selection: HeadSelection = "adaptive"
-    """Which head plans: the best on recent transitions, their average, or a random one."""
+    """Which head plans: the best on recent transitions, their average, or a random one; the most
+    likely one given all transitions, of which those older than `selection_length` hardly count
+    (`evidence`), or one drawn by each member with that probability (`evidence-sampled`)."""
     selection_length: int = 10
     """Past transitions on which heads compete (N)."""
-    selection_error: Literal["mean", "sampled"] = "mean"
+    selection_error: Literal["mean", "sampled", "corrected"] = "mean"
     """Error of the predicted mean in normalised units, or (released code) of samples in raw
-    units."""
+    units; or of the mean with what the head has learned in the episode (last-layer)."""
     selection_skips_newest: bool = False
     """Whether the newest transition is not used to select heads (released code)."""
     reward: Literal["task", "released"] = "task"
@@ -271,6 +273,18 @@ class PlannerConfig:
     adaptation_prior: Literal["owner", "runner-up"] = "owner"
     """Which head's residuals on the training episodes the prior is fitted to: those of the head
     that explains an episode best, or second best, as if it were of unseen physics (last-layer)."""
+    adaptation_variance: bool = False
+    """Whether the uncertainty of what was learned adds to the noise of imagined steps (last-layer);
+    costs one more hidden layer."""
+    forgetting: float = 0.0
+    """Share of the uncertainty before the episode that comes back at every step, so that old
+    transitions count less; 0 never forgets (last-layer)."""
+    change_threshold: float = 0.0
+    """Log Bayes factor for changed physics above which all that was learned is dropped; 0 never
+    does (last-layer)."""
+    risk_aversion: float = 0.0
+    """Candidates are ranked by the mean return minus this many standard deviations over their
+    particles."""
 
     def __post_init__(self):
         problems = _Problems(self)
@@ -287,7 +301,7 @@ class PlannerConfig:
         problems.between(1e-6, 1e6, "temperature")
         problems.one_of("optimizer", typing.get_args(OptimizerName))
         problems.one_of("head_selection", typing.get_args(HeadSelection))
-        problems.one_of("selection_error", ("mean", "sampled"))
+        problems.one_of("selection_error", ("mean", "sampled", "corrected"))
         problems.one_of("reward", ("task", "released"))
         problems.one_of("particle_noise", ("independent", "shared"))
         problems.one_of("precision", ("float32", "bfloat16"))
@@ -295,6 +309,8 @@ class PlannerConfig:
         problems.one_of("adaptation", typing.get_args(Adaptation))
         problems.one_of("adaptation_noise", ("constant", "heads"))
         problems.one_of("adaptation_prior", ("owner", "runner-up"))
+        problems.between(0.0, 0.99, "forgetting")
+        problems.at_least(0, "change_threshold", "risk_aversion")
         share = {"icem": 2, "mppi": 0, "random-shooting": 0}.get(self.optimizer, 1)
         problems.require(
             share * self.num_elites <= self.num_candidates,

@@ -190,6 +190,7 @@ class ClassicEnv(WorldEnv):
             ConfigError: The action has the wrong shape or is not finite.
         """
         self._action = self._world.clip(action, (1,))
+        self._begin_step()
         step = self._world.advance(self._state, self._action[None], self._sim_params)
         self._state = step.state
         reward, terminated = float(step.reward[0]), bool(step.terminated[0])

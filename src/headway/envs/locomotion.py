@@ -44,6 +44,7 @@ class LocomotionEnv(WorldEnv):
         """
         robot, data = self._world, self.data
         action = robot.clip(action, (self.model.nu,))
+        self._begin_step()
         before = self._robot_state()
         data.ctrl[:] = robot.control(action, self._sim_params)
         mujoco.mj_step(self.model, data, nstep=robot.frame_skip)

@@ -10,6 +10,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from headway.envs.schedule import read_schedules
 from headway.envs.world import SimParams, World, read_options
 from headway.errors import BadEnvironmentError, ConfigError
 from headway.sim_params import SimParamSets
@@ -33,6 +34,8 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     - `"sim_params"`: for each named parameter one value, or one per environment; parameters
       that are not named are drawn from the training values;
+    - `"schedule"`: simulator parameters that change during the episode, by the step before which
+      they do, `{100: {"mass_scale": 2.0}}`; one for all environments or a list of one for each;
     - `"reset_mask"`: which environments are reset; the others go on as they are.
 
     With `AutoresetMode.NEXT_STEP` the step after the end of an episode ignores its action,
@@ -67,6 +70,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._elapsed = np.zeros(num_envs, int)
         self._ends = np.zeros((2, num_envs), bool)
         self._sim_params: dict[str, np.ndarray] = {}
+        self._schedules: list[dict[int, SimParams]] = [{}] * num_envs
 
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, *, seed: Seeds = None, options: dict[str, Any] | None = None
@@ -76,11 +80,15 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Raises:
             ConfigError: A seed, option, parameter or value is not allowed.
         """
-        options = read_options(options, ("sim_params", "reset_mask"))
+        options = read_options(options, ("sim_params", "reset_mask", "schedule"))
         seeds = self._read_seeds(seed)
         requested = self._read_sim_params(options["sim_params"])
         chosen = np.flatnonzero(self._read_mask(options.get("reset_mask")))
+        schedule = options.get("schedule")
+        schedules = read_schedules(schedule, self.num_envs, self._check_sim_params)
         self._start(chosen, seeds, requested)
+        for i in chosen:
+            self._schedules[i] = schedules[i]
         return self._observe(), self._info()
 
     def step(
@@ -103,6 +111,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._start(np.flatnonzero(restart), [None] * self.num_envs, nothing)
         active = np.flatnonzero(~self._finished & ~restart)
         if active.size:
+            self._follow_schedules(active)
             outcome = self._advance(active, actions)
             self._elapsed[active] += 1
             rewards[active], terminated[active], truncated[active] = outcome
@@ -130,8 +139,18 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             values = self._begin(int(i), seeds[i], requested[i])
             for name, value in values.items():
                 self._sim_params.setdefault(name, np.full(self.num_envs, np.nan))[i] = value
+            self._schedules[i] = {}
         self._elapsed[chosen] = 0
         self._ends[:, chosen] = False
+
+    def _follow_schedules(self, active: np.ndarray) -> None:
+        """Change the physics of the environments where it is time to."""
+        for i in active:
+            changed = self._schedules[i].get(int(self._elapsed[i]))
+            if changed:
+                self._change(int(i), changed)
+                for name, value in changed.items():
+                    self._sim_params[name][i] = value
 
     def _read_seeds(self, seed: Seeds) -> list[int | None]:
         if seed is None or isinstance(seed, int | np.integer):
@@ -176,6 +195,10 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Start an episode in environment `i` and return its simulator parameters."""
 
     @abc.abstractmethod
+    def _change(self, i: int, changed: SimParams) -> None:
+        """Change some simulator parameters of environment `i` during an episode."""
+
+    @abc.abstractmethod
     def _advance(self, active: np.ndarray, actions: np.ndarray) -> Outcome:
         """Step the environments of the given indices; `actions` has a row for each of all."""
 
@@ -218,6 +241,10 @@ class WorldVectorEnv(HeadwayVectorEnv):
         sim_params = self._world.draw(rng, requested)
         self._apply_sim_params(i, sim_params)
         return sim_params
+
+    def _change(self, i: int, changed: SimParams) -> None:
+        before = {name: float(values[i]) for name, values in self._sim_params.items()}
+        self._apply_sim_params(i, before | changed)
 
     @abc.abstractmethod
     def _set_initial_state(self, i: int, rng: np.random.Generator) -> None:
@@ -277,6 +304,15 @@ class SequentialVectorEnv(HeadwayVectorEnv):
             terminated.append(bool(ends))
             truncated.append(bool(cut))
         return Outcome(np.array(rewards), np.array(terminated), np.array(truncated))
+
+    def _change(self, i: int, changed: SimParams) -> None:
+        change = getattr(self.envs[i].unwrapped, "set_sim_params", None)
+        if change is None:
+            raise ConfigError(
+                "schedule was given, but the environment has no method set_sim_params(values); add"
+                " one, or leave the schedule out."
+            )
+        change(changed)
 
     def _check_obs(self, obs: Any) -> np.ndarray:
         allowed = self.single_observation_space.shape

@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium.spaces import Box
 
+from headway.envs.schedule import read_schedule
 from headway.errors import ConfigError, unknown_name
 from headway.sim_params import SimParamSets
 from headway.tasks.base import Task
@@ -134,6 +135,8 @@ class WorldEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.action_space = world.action_space
         self.observation_space = world.observation_space
         self._sim_params: SimParams = dict(world.catalog_entry.default_sim_params)
+        self._schedule: dict[int, SimParams] = {}
+        self._elapsed = 0
 
     @property
     def sim_params(self) -> SimParams:
@@ -153,13 +156,17 @@ class WorldEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Args:
             seed: Seeds the environment's random numbers.
             options: `{"sim_params": {name: value}}` sets parameters; others are drawn from
-                the training values.
+                the training values. `{"schedule": {step: {name: value}}}` changes parameters
+                before some steps of the episode.
 
         Raises:
             ConfigError: An option, parameter or value is not allowed.
         """
-        requested = self._world.check(read_options(options, ("sim_params",))["sim_params"])
+        options = read_options(options, ("sim_params", "schedule"))
+        requested = self._world.check(options["sim_params"])
+        schedule = read_schedule(options.get("schedule"), self._world.check)
         super().reset(seed=seed)
+        self._schedule, self._elapsed = schedule, 0
         self._reset_state()
         self.set_sim_params(self._world.draw(self.np_random, requested))
         return self.observation(), self._info()
@@ -172,6 +179,13 @@ class WorldEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """
         self._sim_params |= self._world.check(values)
         self._apply_sim_params()
+
+    def _begin_step(self) -> None:
+        """Change the physics if it is time to; every step begins with it."""
+        changed = self._schedule.get(self._elapsed)
+        self._elapsed += 1
+        if changed:
+            self.set_sim_params(changed)
 
     def _info(self) -> dict[str, Any]:
         return {"sim_params": self.sim_params}

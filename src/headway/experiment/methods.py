@@ -46,6 +46,7 @@ _PLAIN: Settings = {
 
 _ONLY_A_TEST: Settings = {"collection.num_iterations": 1}
 _ONE_HEAD: Settings = {"model.num_heads": 1, "fitting.oracle": "independent"}
+_PETS: Settings = {**_NO_CONTEXT, **_ONE_HEAD, "fitting.future_length": 1}
 _VANILLA: Settings = {
     **_ONE_HEAD,
     "model.num_members": 1,
@@ -62,6 +63,11 @@ _CADM: Settings = {
 _METHODS = (
     Method("tmcl", "trajectory-wise multiple choice learning (the paper's method)", {}),
     Method(
+        "tmcl-bayes",
+        "T-MCL whose heads keep learning while they act: a Bayesian last layer",
+        {"planner.adaptation": "last-layer"},
+    ),
+    Method(
         "mcl",
         "multiple choice learning: heads compete for single transitions (Fig. 13)",
         {"fitting.oracle": "transition"},
@@ -69,11 +75,12 @@ _METHODS = (
     Method(
         "pets",
         "ensemble of single-headed probabilistic networks, no context (Chua et al., 2018)",
-        {
-            **_NO_CONTEXT,
-            **_ONE_HEAD,
-            "fitting.future_length": 1,
-        },
+        _PETS,
+    ),
+    Method(
+        "pets-bayes",
+        "PETS whose head keeps learning while it acts: a Bayesian last layer",
+        {**_PETS, "planner.adaptation": "last-layer"},
     ),
     Method(
         "mh-pets",

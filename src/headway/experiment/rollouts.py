@@ -5,7 +5,7 @@ One vector environment and one compiled agent serve collection and evaluation al
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -31,6 +31,8 @@ class Episode:
 
     sim_params: dict[str, float]
     seed: int
+    schedule: Mapping[int, dict[str, float]] = dataclasses.field(default_factory=dict)
+    """Physics that change during the episode, by the step before which they do."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,7 +183,10 @@ def run_episodes(
     names = filled[0].sim_params
     sim_params = {name: np.array([e.sim_params[name] for e in filled]) for name in names}
     seeds: Any = [episode.seed for episode in filled]
-    obs, _ = arena.vector.reset(seed=seeds, options={"sim_params": sim_params})
+    options: dict[str, Any] = {"sim_params": sim_params}
+    if any(episode.schedule for episode in filled):
+        options["schedule"] = [episode.schedule for episode in filled]
+    obs, _ = arena.vector.reset(seed=seeds, options=options)
     observations, actions, rewards = [check(arena, obs, filled, "obs", 0)], [], []
     length = np.zeros(len(filled), np.int64)
     terminated = np.zeros(len(filled), bool)

@@ -24,7 +24,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from headway.models.dynamics import MultiHeadDynamics, Statistics, network_input
-from headway.models.networks import DenseHeads
 from headway.tasks.base import Task
 
 BELIEVABLE = 100.0
@@ -132,7 +131,8 @@ class LastLayer(NamedTuple):
     """What the heads have learned in each environment's episode."""
 
     weight: Float[Array, "env member head feature obs"]
-    """Posterior mean of the correction, in normalised units; the last feature is 1."""
+    """Posterior mean of the correction, in normalised units; it is added to the mean heads, and
+    what belongs to the last feature, the 1, to their biases."""
     root: Float[Array, "env member group feature feature"]
     """Square root S of the posterior covariance in units of the noise variance, P = S Sᵀ."""
 
@@ -156,10 +156,6 @@ class LastLayer(NamedTuple):
             jnp.broadcast_to(start, (num_envs, members, groups, features, features)),
         )
 
-    def correction(self) -> DenseHeads:
-        """What is added to the mean heads, which see the features without the 1."""
-        return DenseHeads(self.weight[..., :-1, :], self.weight[..., -1, :])
-
 
 class Forecast(NamedTuple):
     """What was expected of a transition before it was learned from."""
@@ -180,13 +176,21 @@ def forecast(state: LastLayer, seen: Observed) -> Forecast:
     return Forecast(seen.residual - foreseen, projected, spread)
 
 
-def update(state: LastLayer, seen: Observed) -> LastLayer:
+def first_forecast(prior: Prior, seen: Observed) -> Forecast:
+    """The forecast of heads that have learned nothing yet."""
+    ratio = prior.ratio[:, None, None]
+    projected = jnp.sqrt(ratio) * seen.features[..., None, :]
+    spread = seen.noise + jnp.square(projected).sum(-1)
+    return Forecast(seen.residual, projected, spread)
+
+
+def update(state: LastLayer, seen: Observed, expected: Forecast) -> LastLayer:
     """Learn from one transition per environment (Potter's square-root filter).
 
     S loses a part of rank one, so the covariance can neither grow nor turn negative, however
     many transitions there are.
     """
-    innovation, projected, spread = forecast(state, seen)
+    innovation, projected, spread = expected
     gain = jnp.einsum("emgij,emgj->emgi", state.root, projected) / spread[..., None]
     weight = state.weight + gain[..., :, None] * innovation[..., None, :]
     share = 1.0 / (1.0 + jnp.sqrt(seen.noise / spread))

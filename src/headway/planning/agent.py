@@ -14,10 +14,18 @@ from headway.data import sim_params_row
 from headway.errors import ConfigError
 from headway.models.compilation import jit_networks
 from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.planning.adaptation import LastLayer, Observed, Prior, Seen, update
+from headway.planning.adaptation import Prior
 from headway.planning.devices import whole_on_each
 from headway.planning.heads import RecentTransitions, head_errors, select_heads
 from headway.planning.imagination import ImaginedDynamics
+from headway.planning.learning import (
+    Learned,
+    by_evidence,
+    corrected_errors,
+    doubt,
+    heads_by_evidence,
+    learn,
+)
 from headway.planning.optimizers import SearchState, make_optimizer, where_env
 from headway.planning.returns import RolloutSettings, candidate_returns
 from headway.tasks.base import Task
@@ -32,9 +40,10 @@ class AgentState(NamedTuple):
     acted: Bool[Array, " env"]
     search: SearchState
     key: PRNGKeyArray
+    learned: Learned
+    """What the heads learned in this episode."""
     sim_params: Float[Array, "env sim_param"] | None = None
     """The true simulator parameters, for a model that is told them."""
-    learned: LastLayer | None = None
     """What the heads learned in this episode."""
 
 
@@ -110,8 +119,8 @@ class Agent(eqx.Module):
             jnp.zeros(num_envs, bool),
             make_optimizer(self.planner).init(num_envs, self.planner.horizon, action_size),
             key,
+            Learned.nothing(self, num_envs),
             physics,
-            fresh_layer(self, num_envs),
         )
 
     def act(
@@ -130,18 +139,22 @@ def _act(
     recent = state.recent.push(state.obs, state.action, obs, state.acted)
     # 2. Encode the recent past, once per member, for the whole plan.
     context = encode(agent, recent, state.sim_params)
-    # 3. Learn from that transition, where heads keep learning.
+    # 3. Learn from that transition, where anything keeps learning.
     learned = learn(agent, state.learned, recent, context, state.acted)
     # 4. Choose the head that best explains the recent past.
-    heads = choose_heads(agent, recent, context, error_key=error_key, head_key=head_key)
+    heads = choose_heads(
+        agent, recent, context, error_key=error_key, head_key=head_key, learned=learned
+    )
     # 5. Imagine candidates with it, and search for the best action sequence.
+    chosen, layer = planning_heads(agent, heads), learned.layer
     dynamics = ImaginedDynamics.fold(
         agent.model,
         agent.statistics,
-        planning_heads(agent, heads),
+        chosen,
         context,
         precision=agent.planner.precision,
-        correction=None if learned is None else learned.correction(),
+        correction=None if layer is None else layer.weight,
+        doubt=None if layer is None else doubt(agent, layer, chosen, context),
     )
     settings = RolloutSettings.of(agent.planner, agent.model.num_members)
 
@@ -154,7 +167,7 @@ def _act(
     action = plan.actions[:, 0]
     acted = jnp.ones_like(state.acted)
     search = optimizer.shift(plan.state)
-    state = AgentState(recent, obs, action, acted, search, key, state.sim_params, learned)
+    state = AgentState(recent, obs, action, acted, search, key, learned, state.sim_params)
     decision = Decision(action, heads, plan.failures, plan.evaluations)
     return whole_on_each((state, decision), agent.planner.devices)
 
@@ -177,33 +190,6 @@ def encode(
     return agent.model.context(history, agent.statistics, sim_params)
 
 
-def fresh_layer(agent: Agent, num_envs: int) -> LastLayer | None:
-    """What heads know of an episode that begins; None where they do not keep learning."""
-    if agent.planner.adaptation == "none" or agent.prior is None:
-        return None
-    _, num_heads, head_size, obs_size = agent.model.forward_net.mean_heads.weight.shape
-    groups = num_heads if agent.planner.adaptation_noise == "heads" else 1
-    sizes = num_heads, head_size + 1, obs_size
-    return LastLayer.of_prior(agent.prior, num_envs, sizes, groups=groups)
-
-
-def learn(
-    agent: Agent,
-    learned: LastLayer | None,
-    recent: RecentTransitions,
-    context: Float[Array, "member env context"] | None,
-    happened: Bool[Array, " env"],
-) -> LastLayer | None:
-    """Learn from the newest transition of every environment."""
-    if learned is None or agent.prior is None:
-        return None
-    newest = recent.obs[:, -1], recent.action[:, -1], recent.next_obs[:, -1]
-    seen = Seen.through(agent.model, agent.task, agent.statistics, newest, context)
-    by_heads = agent.planner.adaptation_noise == "heads"
-    reference = agent.prior.log_reference if by_heads else None
-    return update(learned, Observed.of(seen, happened, reference))
-
-
 def choose_heads(
     agent: Agent,
     recent: RecentTransitions,
@@ -211,11 +197,20 @@ def choose_heads(
     *,
     error_key: PRNGKeyArray,
     head_key: PRNGKeyArray,
+    learned: Learned | None = None,
 ) -> Int[Array, "env member"]:
-    """One head per environment and member, by its error on the recent transitions."""
+    """One head per environment and member, by its error on the recent transitions.
+
+    With what was `learned` in the episode, also by the evidence for it.
+    """
+    layer, log_evidence = (None, None) if learned is None else learned[:2]
+    if log_evidence is not None and by_evidence(agent):
+        return heads_by_evidence(agent, log_evidence, recent, key=head_key)
     slots, used = recent.newest(agent.planner)
     if agent.planner.head_selection == "random":
         used = jnp.zeros_like(used)
+    if layer is not None and agent.planner.selection_error == "corrected":
+        return select_heads(corrected_errors(agent, layer, slots, context), used, key=head_key)
     sampling_key = error_key if agent.planner.selection_error == "sampled" else None
     errors = head_errors(
         agent.model, agent.task, agent.statistics, slots, context, sampling_key=sampling_key

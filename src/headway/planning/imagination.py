@@ -17,6 +17,7 @@ from headway.models.dynamics import GaussianNet, MultiHeadDynamics, Statistics
 from headway.models.networks import Dense, DenseHeads, bound_logvar, swish
 from headway.tasks.base import Task
 
+Correction = Float[Array, "env member head feature obs"]
 PRECISIONS = {"float32": jnp.float32, "bfloat16": jnp.bfloat16}
 
 
@@ -51,6 +52,23 @@ class ChosenHeads(NamedTuple):
     max_logvar: Float[Array, "*env member choice obs"] | None
     context_bias: Float[Array, "*env member out"] | None = None
     """Bias of the hidden layer that the context joins; None if it joins the heads."""
+    doubt: "Doubt | None" = None
+
+
+class Doubt(NamedTuple):
+    """How uncertain the chosen heads' corrections are."""
+
+    root: Layer
+    """Sᵀ as a layer: its squared output sums to the variance φᵀPφ of `adaptation`."""
+    scale: Float[Array, "*env member obs"]
+    """Standard deviation of the noise that it multiplies, in raw units."""
+
+    def var(
+        self, hidden: Float[Array, "member hidden particle candidate"]
+    ) -> Float[Array, "member obs particle candidate"]:
+        """Variance of the delta that stems from the correction, in raw units."""
+        total = jnp.square(self.root(hidden)).sum(1, keepdims=True)
+        return total * jnp.square(self.scale)[:, :, None, None]
 
 
 class ImaginedDynamics(eqx.Module):
@@ -78,7 +96,8 @@ class ImaginedDynamics(eqx.Module):
         context: Float[Array, "member env context"] | None,
         *,
         precision: str = "float32",
-        correction: DenseHeads | None = None,
+        correction: Correction | None = None,
+        doubt: "Doubt | None" = None,
     ) -> "ImaginedDynamics":
         """Fold a model for one plan.
 
@@ -89,7 +108,8 @@ class ImaginedDynamics(eqx.Module):
             context: The context vector of each member and environment.
             precision: Of the products' inputs, `float32` or `bfloat16`. The first layer stays
                 in float32: it takes raw observations, whose offsets bfloat16 would not resolve.
-            correction: Added to the mean heads, with a leading environment axis (`adaptation`).
+            correction: Added to the weights of the mean heads, the last row to their biases.
+            doubt: How uncertain the correction is, if plans are to know it.
         """
         net = model.forward_net
         dtype = PRECISIONS[precision]
@@ -116,8 +136,8 @@ class ImaginedDynamics(eqx.Module):
             low, high = net.min_logvar[heads], net.max_logvar[heads]
         weight = jnp.concatenate(weights, axis=-1).mT.astype(dtype)
         output = Layer(weight, jnp.concatenate(biases, axis=-1))
-        heads_and_context = ChosenHeads(output, low, high, context_bias)
-        return cls(hidden, heads_and_context, delta.std, place)
+        own = ChosenHeads(output, low, high, context_bias, doubt)
+        return cls(hidden, own, delta.std, place)
 
     def with_heads(self, heads: ChosenHeads) -> "ImaginedDynamics":
         """The dynamics of one environment, whose heads have no environment axis."""
@@ -147,7 +167,7 @@ class ImaginedDynamics(eqx.Module):
     @property
     def stochastic(self) -> bool:
         """Whether deltas have a variance."""
-        return self.heads.min_logvar is not None
+        return self.heads.min_logvar is not None or self.heads.doubt is not None
 
     def start(self) -> tuple[()]:
         """See `Dynamics.start`; nothing is carried from step to step."""
@@ -181,10 +201,15 @@ class ImaginedDynamics(eqx.Module):
         out = self.heads.layer(x)
         obs_size = self.delta_std.shape[0]
         mean = out[:, :obs_size]
-        low, high = self.heads.min_logvar, self.heads.max_logvar
-        if noise is None or low is None or high is None:
+        low, high, doubt = self.heads[1:]
+        if noise is None:
             return mean
-        return mean + noise * self._std(out[:, obs_size:], low, high)
+        std = jnp.zeros(())
+        if low is not None and high is not None:
+            std = self._std(out[:, obs_size:], low, high)
+        if doubt is not None:
+            std = jnp.sqrt(jnp.square(std) + doubt.var(x))
+        return mean + noise * std
 
     def _std(
         self,
@@ -231,15 +256,15 @@ def _chosen(
     layer: DenseHeads,
     heads: Int[Array, "env member choice"],
     context: Float[Array, "member env context"] | None,
-    correction: DenseHeads | None = None,
+    correction: Correction | None = None,
 ) -> tuple[Float[Array, "env member choice hidden obs"], Float[Array, "env member choice obs"]]:
     """Weights and biases of the chosen heads, the context added to the biases."""
     member = jnp.arange(heads.shape[1])[:, None]
     weight, bias = layer.weight[member, heads], layer.bias[member, heads]
     if correction is not None:
         env = jnp.arange(len(heads))[:, None, None]
-        weight = weight + correction.weight[env, member, heads]
-        bias = bias + correction.bias[env, member, heads]
+        chosen = correction[env, member, heads]
+        weight, bias = weight + chosen[..., :-1, :], bias + chosen[..., -1, :]
     if context is None:
         return weight, bias
     hidden_size = weight.shape[-2] - context.shape[-1]

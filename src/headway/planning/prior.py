@@ -24,7 +24,7 @@ from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.planning.adaptation import MAX_LOG_NOISE, Prior, Seen
 from headway.tasks.base import Task
 
-RATIOS = np.geomspace(1e-7, 1e3, 201)
+RATIOS = np.geomspace(1e-7, 1e7, 281)
 """Ratios of prior to noise variance that are tried."""
 MAX_EPISODES = 100
 """Episodes that are looked at, evenly spread over those collected; the paper's are all."""
@@ -113,8 +113,8 @@ def fit_prior(
     for trajectory in chosen:
         episode = Episodes.pad([trajectory], 1, longest, model.sim_param_names)
         found = _look(model, task, statistics, episode, history_length)
-        steps = len(trajectory)
-        seen.append(jax.tree.map(lambda x, n=steps: np.asarray(x[:n], np.float64), found))
+        steps = slice(len(trajectory))
+        seen.append(jax.tree.map(lambda x, s=steps: np.asarray(x[s], np.float64), found))
     of_members = [
         _member_prior([_of_member(one, member, rank) for one in seen], head_noise=head_noise)
         for member in range(model.num_members)

@@ -23,6 +23,8 @@ class RolloutSettings:
     """Whether all candidates of a step share the noise of their particles."""
     released_reward: bool = False
     """Whether to plan with the released code's reward."""
+    risk_aversion: float = 0.0
+    """Standard deviations over the particles that are taken off the mean return."""
     devices: Devices = "local"
     """Which devices share the candidates."""
 
@@ -33,6 +35,7 @@ class RolloutSettings:
             planner.num_particles // num_members,
             planner.particle_noise == "shared",
             planner.reward == "released",
+            planner.risk_aversion,
             planner.devices,
         )
 
@@ -180,4 +183,6 @@ def _environment_returns(
     memory = jax.tree.map(wide, dynamics.start())
     carry = wide(obs), jnp.ones(rows, bool), jnp.zeros(rows), memory
     (_, _, total, _), _ = jax.lax.scan(imagine, carry, (candidates.transpose(1, 2, 0), noise))
-    return total.mean((0, 1))
+    if not settings.risk_aversion:
+        return total.mean((0, 1))
+    return total.mean((0, 1)) - settings.risk_aversion * total.std((0, 1))

@@ -1,0 +1,189 @@
+"""What an agent learns while it acts: corrections of its heads, and how much to trust each head."""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from headway.planning.adaptation import (
+    LastLayer,
+    Observed,
+    Prior,
+    Seen,
+    first_forecast,
+    forecast,
+    forget,
+    log_likelihood,
+    update,
+)
+from headway.planning.heads import RecentTransitions
+from headway.planning.imagination import PRECISIONS, Doubt, Layer
+from headway.planning.optimizers import where_env
+
+if TYPE_CHECKING:
+    from headway.planning.agent import Agent
+
+Context = Float[Array, "member env context"] | None
+
+
+class Learned(NamedTuple):
+    """What was learned in the episode of each environment; None where nothing of it is wanted."""
+
+    layer: LastLayer | None = None
+    """The corrections of the heads."""
+    log_evidence: Float[Array, "env member head"] | None = None
+    """Log-likelihood of the recent transitions under each head, older ones counting less."""
+    suspicion: Float[Array, " env"] | None = None
+    """Evidence that the physics has changed, as a log Bayes factor; never below 0."""
+
+    @classmethod
+    def nothing(cls, agent: "Agent", num_envs: int) -> "Learned":
+        """At the start of an episode."""
+        planner, heads = agent.planner, agent.model.forward_net.mean_heads
+        members, num_heads, head_size, obs_size = heads.weight.shape
+        layer = log_evidence = suspicion = None
+        if agent.prior is not None and planner.adaptation != "none":
+            groups = num_heads if planner.adaptation_noise == "heads" else 1
+            sizes = num_heads, head_size + 1, obs_size
+            layer = LastLayer.of_prior(agent.prior, num_envs, sizes, groups=groups)
+            if planner.change_threshold:
+                suspicion = jnp.zeros(num_envs)
+        if by_evidence(agent):
+            log_evidence = jnp.zeros((num_envs, members, num_heads))
+        return cls(layer, log_evidence, suspicion)
+
+
+def by_evidence(agent: "Agent") -> bool:
+    """Whether heads are chosen by the likelihood of what they predicted."""
+    return agent.planner.head_selection in ("evidence", "evidence-sampled")
+
+
+def learn(
+    agent: "Agent",
+    learned: Learned,
+    recent: RecentTransitions,
+    context: Context,
+    happened: Bool[Array, " env"],
+) -> Learned:
+    """Learn from the newest transition of every environment.
+
+    Args:
+        agent: The agent.
+        learned: What was learned before.
+        recent: The newest transition is in the last slot.
+        context: The context vectors that the heads plan with.
+        happened: Where there was a transition.
+    """
+    if learned.layer is None and learned.log_evidence is None:
+        return learned
+    newest = recent.obs[:, -1], recent.action[:, -1], recent.next_obs[:, -1]
+    seen = Seen.through(agent.model, agent.task, agent.statistics, newest, context)
+    layer, suspicion = learned.layer, learned.suspicion
+    if layer is None or agent.prior is None:
+        likelihood = own_log_likelihood(seen)
+    else:
+        by_heads = agent.planner.adaptation_noise == "heads"
+        observed = Observed.of(seen, happened, agent.prior.log_reference if by_heads else None)
+        if agent.planner.forgetting:
+            layer = forget(layer, agent.prior, agent.planner.forgetting)
+        expected = forecast(layer, observed)
+        likelihood = log_likelihood(expected, agent.prior.noise)
+        if suspicion is not None:
+            suspicion = suspicion + surprise(agent.prior, observed, likelihood)
+            changed = suspicion > agent.planner.change_threshold
+            suspicion = jnp.where(changed, 0.0, jnp.maximum(suspicion, 0.0))
+            layer = where_env(changed, Learned.nothing(agent, len(changed)).layer, layer)
+            expected = forecast(layer, observed)
+        layer = update(layer, observed, expected)
+    log_evidence = learned.log_evidence
+    if log_evidence is not None:
+        kept = (1.0 - 1.0 / agent.planner.selection_length) * log_evidence
+        told = happened[:, None, None] & jnp.isfinite(likelihood)
+        log_evidence = jnp.where(told, kept + likelihood, log_evidence)
+    return Learned(layer, log_evidence, suspicion)
+
+
+def own_log_likelihood(seen: Seen) -> Float[Array, "env member head"]:
+    """Log-density of a transition under each head as it was trained, without constants.
+
+    Deterministic heads count as having a variance of 1.
+    """
+    squared = jnp.square(seen.residual)
+    if seen.logvar is None:
+        return -0.5 * squared.sum(-1)
+    return -0.5 * (squared * jnp.exp(-seen.logvar) + seen.logvar).sum(-1)
+
+
+def surprise(
+    prior: Prior, observed: Observed, likelihood: Float[Array, "env member head"]
+) -> Float[Array, " env"]:
+    """How much better a transition is explained by an episode that has only begun.
+
+    The log Bayes factor of heads that know nothing yet against those that have learned, heads
+    being equally likely, on average over members.
+    """
+    anew = log_likelihood(first_forecast(prior, observed), prior.noise)
+    both = [jax.scipy.special.logsumexp(x, axis=-1) for x in (anew, likelihood)]
+    return (both[0] - both[1]).mean(-1)
+
+
+def heads_by_evidence(
+    agent: "Agent",
+    log_evidence: Float[Array, "env member head"],
+    recent: RecentTransitions,
+    *,
+    key: PRNGKeyArray,
+) -> Int[Array, "env member"]:
+    """The head of the most evidence, or one drawn with its posterior probability.
+
+    Every member draws for itself, so with `evidence-sampled` the particles are spread over heads
+    by weight. Without any evidence the head is random.
+    """
+    drawn = jax.random.categorical(key, log_evidence, axis=-1)
+    if agent.planner.head_selection == "evidence-sampled":
+        return drawn
+    return jnp.where(recent.count[:, None] > 0, log_evidence.argmax(-1), drawn)
+
+
+def corrected_errors(
+    agent: "Agent", layer: LastLayer, recent: RecentTransitions, context: Context
+) -> Float[Array, "env member head slot"]:
+    """`heads.head_errors` of the heads with their corrections, in normalised units."""
+    num_envs, num_slots = recent.obs.shape[:2]
+    rows = [x.reshape(num_envs * num_slots, -1) for x in recent[:3]]
+    if context is not None:
+        context = jnp.repeat(context, num_slots, axis=1)
+    seen = Seen.through(
+        agent.model, agent.task, agent.statistics, (rows[0], rows[1], rows[2]), context
+    )
+    features = seen.features.reshape(num_envs, num_slots, *seen.features.shape[1:])
+    residual = seen.residual.reshape(num_envs, num_slots, *seen.residual.shape[1:])
+    foreseen = jnp.einsum("esmi,emhio->esmho", features, layer.weight)
+    return jnp.square(residual - foreseen).mean(-1).transpose(0, 2, 3, 1)
+
+
+def doubt(
+    agent: "Agent",
+    layer: LastLayer,
+    heads: Int[Array, "env member choice"],
+    context: Context,
+) -> Doubt | None:
+    """How uncertain the corrections of the chosen heads are; None if plans need not know.
+
+    Several heads are averaged, and what they learned is independent given the features.
+    """
+    if not agent.planner.adaptation_variance or agent.prior is None:
+        return None
+    groups, choices = layer.root.shape[2], heads.shape[-1]
+    group = jnp.minimum(heads[..., 0], groups - 1)
+    root = jnp.take_along_axis(layer.root, group[..., None, None, None], axis=2)[:, :, 0]
+    rest = jnp.ones((*root.shape[:2], 1))
+    if context is not None and agent.model.forward_net.context_layer is None:
+        rest = jnp.concatenate([context.transpose(1, 0, 2), rest], axis=-1)
+    hidden = root.shape[-1] - rest.shape[-1]
+    bias = jnp.einsum("emij,emi->emj", root[..., hidden:, :], rest)
+    scale = jnp.sqrt(agent.prior.noise / choices) * agent.statistics.delta.std
+    precision = PRECISIONS[agent.planner.precision]
+    weight = root[..., :hidden, :].mT.astype(precision)
+    return Doubt(Layer(weight, bias), jnp.broadcast_to(scale, (len(heads), *scale.shape)))

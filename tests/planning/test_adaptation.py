@@ -1,0 +1,295 @@
+"""Heads that keep learning: exact against batch regression in NumPy, safe, bounded, resettable."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import toys
+from headway.config import PlannerConfig
+from headway.errors import ConfigError
+from headway.models.dynamics import MultiHeadDynamics
+from headway.planning import learning
+from headway.planning.adaptation import (
+    LastLayer,
+    Observed,
+    Prior,
+    first_forecast,
+    forecast,
+    forget,
+    log_likelihood,
+    update,
+)
+from headway.planning.agent import Agent, reset_where
+from headway.planning.learning import Learned
+
+ENVS, MEMBERS, HEADS, FEATURES, OBS = 2, 2, 3, 12, 2
+LAST_LAYER = PlannerConfig(
+    horizon=4,
+    num_candidates=40,
+    num_elites=8,
+    num_iterations=3,
+    num_particles=2,
+    selection_length=3,
+    adaptation="last-layer",
+)
+
+
+def some_prior(ratio=0.5):
+    ratios = jnp.asarray([ratio, 2.0 * ratio])
+    return Prior(ratios, jnp.asarray([[0.1, 0.2], [0.3, 0.4]]), jnp.zeros(MEMBERS))
+
+
+def some_transitions(steps, groups=1, seed=0):
+    """Transitions [step, env, ...] whose features are correlated and of unequal sizes."""
+    rng = np.random.default_rng(seed)
+    mixing = rng.normal(size=(FEATURES, FEATURES)) * np.geomspace(1.0, 0.01, FEATURES)
+    features = rng.normal(size=(steps, ENVS, MEMBERS, FEATURES)) @ mixing
+    truth = rng.normal(size=(ENVS, MEMBERS, HEADS, FEATURES, OBS))
+    residual = np.einsum("semi,emhio->semho", features, truth)
+    residual += 0.1 * rng.normal(size=residual.shape)
+    noise = rng.uniform(0.3, 3.0, (steps, ENVS, MEMBERS, groups)) if groups > 1 else 1.0
+    noise = np.broadcast_to(noise, (steps, ENVS, MEMBERS, groups))
+    return Observed(*(jnp.asarray(x, jnp.float32) for x in (features, residual, noise)))
+
+
+@jax.jit
+def learn_all(state, transitions):
+    def step(state, seen):
+        return update(state, seen, forecast(state, seen)), None
+
+    return jax.lax.scan(step, state, transitions)[0]
+
+
+def fresh(prior, groups=1):
+    return LastLayer.of_prior(prior, ENVS, (HEADS, FEATURES, OBS), groups=groups)
+
+
+def batch_posterior(prior, transitions, env, member, head, group):
+    """Mean and covariance (over the noise variance) of Bayesian linear regression, float64."""
+    f, r, n = (np.asarray(x, np.float64)[:, env, member] for x in transitions)
+    whitened = f / n[:, group, None]
+    precision = np.eye(f.shape[1]) / float(prior.ratio[member]) + whitened.T @ f
+    return np.linalg.solve(precision, whitened.T @ r[:, head]), np.linalg.inv(precision)
+
+
+@pytest.mark.parametrize("groups", [1, HEADS])
+def test_a_thousand_updates_equal_batch_regression_in_float64(groups):
+    prior, transitions = some_prior(), some_transitions(1000, groups)
+    state = learn_all(fresh(prior, groups), transitions)
+    for env, member, head in np.ndindex(ENVS, MEMBERS, HEADS):
+        group = min(head, groups - 1)
+        mean, covariance = batch_posterior(prior, transitions, env, member, head, group)
+        np.testing.assert_allclose(state.weight[env, member, head], mean, atol=1e-5)
+        root = np.asarray(state.root, np.float64)[env, member, group]
+        np.testing.assert_allclose(root @ root.T, covariance, atol=1e-5)
+
+
+def test_a_prior_of_zero_never_learns():
+    prior = some_prior(0.0)
+    state = learn_all(fresh(prior), some_transitions(50))
+    assert not np.asarray(state.weight).any()
+    assert not np.asarray(state.root).any()
+    forgotten = forget(state, prior, 0.1)
+    assert not np.asarray(forgotten.weight).any()
+    assert np.isfinite(forgotten.root).all()
+
+
+def test_a_hundred_thousand_updates_stay_finite_and_within_the_prior():
+    prior = some_prior(1e5)
+    transitions = some_transitions(1000)
+    transitions = transitions._replace(features=30.0 * transitions.features)
+
+    def again(_, state):
+        return learn_all(state, transitions)
+
+    state = jax.jit(lambda state: jax.lax.fori_loop(0, 100, again, state))(fresh(prior))
+    assert np.isfinite(state.weight).all()
+    covariance = np.asarray(state.root @ state.root.mT)
+    largest = np.asarray(prior.ratio)[:, None]
+    diagonal = np.diagonal(covariance, axis1=-2, axis2=-1)[:, :, 0]
+    assert (diagonal > 0).all()
+    assert (diagonal <= largest).all()
+    residual = np.asarray(forecast(state, jax.tree.map(lambda x: x[0], transitions)).innovation)
+    assert np.square(residual).mean() < 0.1
+
+
+def test_forgetting_is_the_drift_whose_stationary_distribution_is_the_prior():
+    """Against Gaussian-process regression with weights of correlation (1 - share)^(|t - s| / 2)."""
+    prior, share, steps = some_prior(), 0.2, 12
+    transitions = some_transitions(steps)
+    state = fresh(prior)
+    for step in range(steps):
+        seen = jax.tree.map(lambda x, step=step: x[step], transitions)
+        state = forget(state, prior, share)
+        expected = forecast(state, seen)
+        state = update(state, seen, expected)
+    f, r, _ = (np.asarray(x, np.float64)[:, 0, 1] for x in transitions)
+    lag = np.abs(np.subtract.outer(range(steps), range(steps)))
+    kernel = float(prior.ratio[1]) * (f @ f.T) * (1 - share) ** (lag / 2)
+    past = np.linalg.solve(kernel[:-1, :-1] + np.eye(steps - 1), r[:-1, 2])
+    mean = kernel[-1, :-1] @ past
+    np.testing.assert_allclose(expected.innovation[0, 1, 2], r[-1, 2] - mean, atol=1e-4)
+    solved = np.linalg.solve(kernel[:-1, :-1] + np.eye(steps - 1), kernel[:-1, -1])
+    variance = 1.0 + kernel[-1, -1] - kernel[-1, :-1] @ solved
+    np.testing.assert_allclose(expected.spread[0, 1, 0], variance, rtol=1e-4)
+
+
+def test_likelihood_is_the_gaussian_density_of_the_forecast():
+    prior, transitions = some_prior(), some_transitions(1)
+    seen = jax.tree.map(lambda x: x[0], transitions)
+    expected = first_forecast(prior, seen)
+    for got, want in zip(expected, forecast(fresh(prior), seen), strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-4)
+    var = np.asarray(expected.spread)[..., None] * np.asarray(prior.noise)[:, None]
+    density = np.exp(-0.5 * np.asarray(seen.residual) ** 2 / var) / np.sqrt(2 * np.pi * var)
+    np.testing.assert_allclose(
+        log_likelihood(expected, prior.noise), np.log(density).sum(-1), rtol=1e-4
+    )
+
+
+# With an agent. One wrong head, whose gain the episode teaches: the toy model is linear, so its
+# features x and -x suffice.
+WRONG = toys.linear_model([[0.4 * np.eye(2), -np.eye(2)], [0.3 * np.eye(2), -np.eye(2)]])
+POINT_PRIOR = Prior(jnp.full(2, 1e4), jnp.full((2, 2), 1e-4), jnp.zeros(2))
+
+
+def make_agent(model=WRONG, prior=POINT_PRIOR, **settings):
+    planner = dataclasses.replace(LAST_LAYER, **settings)
+    return Agent(model, toys.identity_statistics(), toys.POINT, planner, 3, prior)
+
+
+def play(agent, gain, steps, *, state=None, spike=None, first_random=0):
+    """Act on `obs' = obs + gain * push`, the push being the action and some noise."""
+    rng = np.random.default_rng(0)
+    state = agent.init(2, key=jax.random.key(0)) if state is None else state
+    decisions, obs = [], np.float32([[0.8, -0.6], [0.5, 0.5]])
+    for step in range(steps):
+        state, decision = agent.act(state, obs if spike is None or step != 3 else spike)
+        decisions.append(decision)
+        push = np.asarray(decision.action) * (step >= first_random) + rng.uniform(-0.5, 0.5, (2, 2))
+        state = state._replace(action=jnp.asarray(push, jnp.float32))
+        obs = (obs + gain * push).astype(np.float32)
+    return state, decisions
+
+
+def predicted_gain(agent, state):
+    """What the chosen head now says that a push of 1 does, per env and member."""
+    weight = agent.model.forward_net.mean_heads.weight + state.learned.layer.weight[..., :-1, :]
+    obs_size = agent.task.obs_size
+    size = obs_size + agent.task.action_size
+    slope = 0.5 * (weight[:, :, 0, obs_size] - weight[:, :, 0, size + obs_size])
+    return np.asarray(slope)[..., 0]
+
+
+def test_the_heads_learn_the_episodes_physics_and_forget_them_with_it():
+    agent = make_agent()
+    state, _ = play(agent, 1.0, 15, first_random=15)
+    np.testing.assert_allclose(predicted_gain(agent, state), 1.0, atol=0.05)
+    start = agent.init(2, key=jax.random.key(1))
+    reset = reset_where(state, start, jnp.asarray([True, False]))
+    np.testing.assert_allclose(predicted_gain(agent, reset)[0], [0.4, 0.3], atol=1e-6)
+    np.testing.assert_allclose(predicted_gain(agent, reset)[1], 1.0, atol=0.05)
+    np.testing.assert_array_equal(reset.learned.layer.root[0], start.learned.layer.root[0])
+
+
+def test_plans_use_what_was_learned():
+    """The head says that pushing does the opposite; only a corrected plan approaches zero."""
+    opposite = toys.linear_model([[-0.5 * np.eye(2)] * 2] * 2)
+    ends = {}
+    for adaptation in ("none", "last-layer"):
+        agent = make_agent(opposite, adaptation=adaptation)
+        state, _ = play(agent, 0.4, 25, first_random=10)
+        ends[adaptation] = np.abs(np.asarray(state.recent.next_obs[:, -1])).max()
+    assert ends["last-layer"] < 0.6
+    assert ends["none"] > 2.0
+
+
+def test_without_anything_to_learn_actions_are_those_of_frozen_heads():
+    zero = POINT_PRIOR._replace(ratio=jnp.zeros(2))
+    frozen, _ = play(make_agent(adaptation="none"), 1.0, 4)
+    learning_nothing, _ = play(make_agent(prior=zero), 1.0, 4)
+    np.testing.assert_array_equal(frozen.search.guess, learning_nothing.search.guess)
+
+
+@pytest.mark.parametrize("value", [1e4, 1e18, 1e30, np.inf, np.nan])
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"forgetting": 0.1, "change_threshold": 10.0, "head_selection": "evidence"}],
+    ids=["plain", "forgetting"],
+)
+def test_absurd_observations_give_finite_actions_and_are_not_learned(value, settings):
+    agent = make_agent(toys.small_model(), **settings)
+    spike = np.full((2, 2), value, np.float32)
+    agent = dataclasses.replace(agent, prior=POINT_PRIOR)
+    state, decisions = play(agent, 1.0, 8, spike=spike)
+    for decision in decisions:
+        assert np.isfinite(decision.action).all()
+    assert np.isfinite(state.learned.layer.weight).all()
+    assert np.abs(state.learned.layer.weight).max() < 1e3
+    if settings:
+        assert np.isfinite(state.learned.log_evidence).all()
+        assert np.isfinite(state.learned.suspicion).all()
+
+
+def test_one_head_without_context_and_deterministic_models_learn_too():
+    config = dataclasses.replace(toys.SMALL, num_heads=1, context_size=0, deterministic=True)
+    model = MultiHeadDynamics.init(
+        dataclasses.replace(config, backward_net=False), toys.POINT, key=jax.random.key(0)
+    )
+    for noise in ("constant", "heads"):
+        state, decisions = play(make_agent(model, adaptation_noise=noise), 1.0, 5)
+        assert np.isfinite(decisions[-1].action).all()
+        assert np.abs(state.learned.layer.weight).max() > 0.0
+
+
+def test_changed_physics_are_noticed_and_what_was_learned_is_dropped():
+    errors = {}
+    for threshold in (0.0, 10.0):
+        agent = make_agent(change_threshold=threshold)
+        before, _ = play(agent, 1.0, 15, first_random=15)
+        state = before._replace(acted=jnp.zeros(2, bool))  # the two parts do not meet
+        after, _ = play(agent, -0.2, 12, state=state, first_random=12)
+        errors[threshold] = np.abs(predicted_gain(agent, after) + 0.2).max()
+        if threshold:
+            assert (np.asarray(before.learned.suspicion) < threshold).all()
+    assert errors[10.0] < 0.05
+    assert errors[10.0] < 0.5 * errors[0.0]
+
+
+def test_evidence_finds_the_head_that_predicts_and_keeps_it_through_noise():
+    agent = make_agent(head_selection="evidence", adaptation="none", prior=None)
+    state, decisions = play(agent, -1.0, 6)
+    assert decisions[-1].heads.tolist() == [[1, 1], [1, 1]]
+    assert state.learned.layer is None
+    sampled = make_agent(head_selection="evidence-sampled", adaptation="none", prior=None)
+    evidence = jnp.log(jnp.asarray([[[0.75, 0.25]] * 2] * 2))
+    keys = jax.random.split(jax.random.key(0), 400)
+    draw = jax.vmap(
+        lambda key: learning.heads_by_evidence(sampled, evidence, state.recent, key=key)
+    )
+    np.testing.assert_allclose(draw(keys).mean(), 0.25, atol=0.04)
+
+
+def test_selection_by_corrected_errors_prefers_what_was_learned():
+    agent = make_agent(selection_error="corrected")
+    state, _ = play(agent, 1.0, 8)
+    layer = state.learned.layer
+    errors = learning.corrected_errors(agent, layer, state.recent, None)
+    plain = learning.corrected_errors(
+        agent, layer._replace(weight=0.0 * layer.weight), state.recent, None
+    )
+    assert errors.shape == (2, 2, 2, 3)
+    assert (errors.sum(-1) < plain.sum(-1)).all()
+
+
+def test_an_agent_needs_a_prior_to_adapt():
+    with pytest.raises(ConfigError, match="fit_prior"):
+        make_agent(prior=None)
+
+
+def test_nothing_is_remembered_where_nothing_keeps_learning():
+    agent = make_agent(adaptation="none", prior=None)
+    assert jax.tree.leaves(Learned.nothing(agent, 2)) == []
