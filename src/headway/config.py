@@ -340,4 +340,9 @@ class Config:
             f"planner.num_particles is {self.planner.num_particles}, allowed: 1, because the"
             " simulator has no noise",
         )
+        problems.require(
+            self.model.kind != "simulator" or self.planner.reward == "task",
+            f"planner.reward is {shown(self.planner.reward)}, allowed: task, which the simulator"
+            " pays",
+        )
         problems.report()

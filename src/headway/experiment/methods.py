@@ -94,7 +94,7 @@ _METHODS = (
     Method(
         "true-dynamics",
         "the same planner on the real simulator: the environment's ceiling",
-        {**_PLAIN, **_ONLY_A_TEST, "model.kind": "simulator"},
+        {**_PLAIN, **_ONLY_A_TEST, "model.kind": "simulator", "planner.reward": "task"},
     ),
 )
 
