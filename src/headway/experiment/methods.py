@@ -23,6 +23,8 @@ class Method:
     name: str
     description: str
     settings: Settings
+    by_preset: Mapping[str, Settings] = dataclasses.field(default_factory=dict)
+    """What replaces some of them in a preset, by its name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,6 +86,33 @@ _METHODS = (
             "fitting.oracle": "independent",
             "fitting.future_length": 1,
             "planner.num_particles": 1,
+        },
+    ),
+    Method(
+        "grbal",
+        "one network that a gradient step adapts online (Nagabandi et al., 2019)",
+        {
+            **_PLAIN,
+            "model.kind": "gradient-adapted",
+            "model.hidden_sizes": (512, 512, 512),
+        },
+        {
+            "quick": {"model.hidden_sizes": (128, 128, 128)},
+            "smoke": {"model.hidden_sizes": (16, 16)},
+        },
+    ),
+    Method(
+        "rebal",
+        "one recurrent network that remembers the episode (Nagabandi et al., 2019)",
+        {
+            **_PLAIN,
+            "model.kind": "recurrent",
+            "model.hidden_sizes": (256,),
+            "fitting.learning_rate": 1e-2,
+        },
+        {
+            "quick": {"model.hidden_sizes": (128,)},
+            "smoke": {"model.hidden_sizes": (16,)},
         },
     ),
     Method(
@@ -201,7 +230,12 @@ def make_config(
     for name in ("env", "method", "preset", "seed"):
         if name in (settings or {}):
             raise ConfigError(f"{name} is no setting to override; pass it as {name}=... instead.")
-    named = {**PRESETS[preset].settings(spec), **METHODS[method].settings}
+    chosen = METHODS[method]
+    named = {
+        **PRESETS[preset].settings(spec),
+        **chosen.settings,
+        **chosen.by_preset.get(preset, {}),
+    }
     start = Config(env=spec.name, method=method, preset=preset)
     config = override(start, {**named, "seed": seed, **(settings or {})})
     check_options(config)
