@@ -118,10 +118,17 @@ class ModelConfig:
     relation_head: bool = False
     """Whether a linear layer learns to tell which contexts come from the same trajectory, and
     thereby shapes the context (RIA); wants one head and a `learned` context."""
+    adaptation_length: int = 16
+    """Newest transitions that a gradient step adapts to while acting; in training, also the
+    transitions that follow and judge the step (gradient-adapted; GrBAL)."""
+    adaptation_rate: float = 1e-3
+    """Size of that step (gradient-adapted; GrBAL)."""
 
     def __post_init__(self):
         problems = _Problems(self)
         problems.at_least(1, "num_members", "num_heads", "history_length")
+        problems.at_least(1, "adaptation_length")
+        problems.between(1e-12, 1.0, "adaptation_rate")
         problems.at_least(0, "context_size")
         problems.sizes("hidden_sizes")
         problems.sizes("context_hidden_sizes")
@@ -157,7 +164,8 @@ class FittingConfig:
     epochs: int = 50
     """Passes over the data per iteration."""
     batch_size: int = 256
-    """Samples per member and update."""
+    """Samples per member and update. Gradient-adapted: transitions per update, half of them to
+    adapt to. Recurrent: transitions per update, in whole episodes, at least one."""
     block_transitions: int = 200_000
     """Most transitions, padding counted, that are fitted as one block; larger data are gone
     through block by block, in bounded memory. The paper's data are one block."""
@@ -165,6 +173,8 @@ class FittingConfig:
     """Adam's step size."""
     future_length: int = 5
     """Transitions ahead that are predicted with one context (F; released code)."""
+    backprop_steps: int = 100
+    """Steps that the gradient flows back through time (recurrent; ReBAL)."""
     backward_weight: float = 0.5
     """Weight of the backward net's loss (released code)."""
     logvar_bound_weight: float = 0.01
@@ -192,7 +202,7 @@ class FittingConfig:
     def __post_init__(self):
         problems = _Problems(self)
         problems.at_least(1, "segment_length", "epochs", "batch_size", "future_length")
-        problems.at_least(1, "block_transitions")
+        problems.at_least(1, "block_transitions", "backprop_steps")
         problems.at_least(
             0, "warmup_iterations", "backward_weight", "logvar_bound_weight", "weight_decay"
         )
@@ -403,5 +413,10 @@ class Config:
             self.model.kind != "simulator" or self.planner.num_particles == 1,
             f"planner.num_particles is {self.planner.num_particles}, allowed: 1, because the"
             " simulator has no noise",
+        )
+        problems.require(
+            self.model.kind != "simulator" or self.planner.reward == "task",
+            f"planner.reward is {shown(self.planner.reward)}, allowed: task, which the simulator"
+            " pays",
         )
         problems.report()

@@ -6,7 +6,7 @@
 import mujoco
 import mujoco.rollout
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from headway.envs.robots import RobotState
 from headway.envs.vector_worlds import RolloutVectorEnv, num_cpus
@@ -28,7 +28,7 @@ class RobotFutures:
     def __init__(self, vector: RolloutVectorEnv):
         self.vector = vector
         self._model = vector.world.new_model()
-        # A robot that MuJoCo gives up on stays non-finite instead of starting over.
+        # A robot that MuJoCo gives up on stays where it is instead of starting over.
         self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET.value
         threads = num_cpus()
         self._datas = [mujoco.MjData(self._model) for _ in range(threads)]
@@ -38,6 +38,8 @@ class RobotFutures:
         self, i: int, actions: Float[np.ndarray, "candidate horizon action"]
     ) -> tuple[RobotState, RobotState]:
         """States before and after every step of every sequence, [candidate, horizon, ...].
+
+        Where MuJoCo gives up on a sequence, its states are NaN.
 
         Args:
             i: The environment to start from.
@@ -57,6 +59,7 @@ class RobotFutures:
             initial_warmstart=np.tile(start.warm, (count, 1)),
         )
         assert states.shape == (count, horizon * skip, mujoco.mj_stateSize(model, _PHYSICS))
+        states[_given_up(states, start.state[0], model.opt.timestep)] = np.nan
         first = np.broadcast_to(start.state, (count, 1, len(start.state)))
         reached = np.concatenate([first, states[:, skip - 1 :: skip]], axis=1)
         qpos = reached[..., 1 : 1 + model.nq]
@@ -67,3 +70,12 @@ class RobotFutures:
         now = np.full((count, 1), start.velocity)
         velocity = np.concatenate([now, after.velocity[:, :-1]], axis=1)
         return before._replace(velocity=velocity), after
+
+
+def _given_up(
+    states: Float[np.ndarray, "candidate time state"], begin: float, timestep: float
+) -> Bool[np.ndarray, " candidate"]:
+    """Where numbers are too large for MuJoCo, or its clock, the first number, stands still."""
+    end = begin + (states.shape[1] - 0.5) * timestep
+    sound = (np.abs(states) < mujoco.mjMAXVAL).all((1, 2)) & (states[:, -1, 0] > end)
+    return ~sound

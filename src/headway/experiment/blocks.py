@@ -30,6 +30,7 @@ from headway.models.fitting import EpochStats, FitData, FitSetup, FitState, fit_
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
+State = TypeVar("State")
 
 
 class Layout(NamedTuple):
@@ -179,9 +180,31 @@ def fit_blocks(
     Returns:
         The new state, and averages over all updates.
     """
+
+    def fit(state: FitState, data: FitData, key: PRNGKeyArray) -> tuple[FitState, EpochStats]:
+        return fit_epoch(state, setup, data, independent=independent, key=key)
+
+    return fit_each(state, blocks, fit)
+
+
+def fit_each(
+    state: State,
+    blocks: Iterable[Block],
+    fit: Callable[[State, FitData, PRNGKeyArray], tuple[State, EpochStats]],
+) -> tuple[State, EpochStats]:
+    """Fit one block after the other, by any procedure.
+
+    Args:
+        state: What fitting changes.
+        blocks: Those of one epoch.
+        fit: Goes once through the data of a block.
+
+    Returns:
+        The new state, and averages over all updates.
+    """
     found = []
     for block in blocks:
-        state, stats = fit_epoch(state, setup, block.data, independent=independent, key=block.key)
+        state, stats = fit(state, block.data, block.key)
         found.append(jax.device_get(stats))  # waits until the device is done with the block
         del block
     return state, merge_stats(found)

@@ -1,7 +1,7 @@
 """What a trained model has learned: head shares per physics, error by imagined step."""
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from headway.data import Episodes, Trajectory, sim_params_row
 from headway.experiment.tables import format_sim_params
 from headway.models.fitting import FitSetup, assign_segments
+from headway.planning.acting import Physics
 from headway.planning.agent import Agent, choose_heads, encode, planning_heads
 from headway.planning.heads import RecentTransitions
 from headway.planning.imagination import ImaginedDynamics
@@ -58,30 +59,63 @@ def prediction_error(
     the episode's own actions lead to. Errors are in units of each dimension's standard
     deviation over these episodes; members are averaged over.
     """
-    horizon = agent.planner.horizon
     slots = max(agent.history_length, agent.planner.selection_length)
-    starts = [(t, s) for t in trajectories for s in range(slots, len(t) - horizon + 1)]
+
+    def imagine(recent, actions, sim_params):
+        names = agent.sim_param_names
+        rows = [sim_params_row(row, names) for row in sim_params]
+        told = jnp.asarray(np.stack(rows)) if names else None
+        return _imagine(agent, recent, told, actions, key)
+
+    return imagined_error(
+        imagine,
+        trajectories,
+        agent.planner.horizon,
+        slots=slots,
+        first=slots,
+    )
+
+
+def imagined_error(
+    imagine: Callable[
+        [RecentTransitions, Array, Physics], Float[Array, "member start horizon obs"]
+    ],
+    trajectories: list[Trajectory],
+    horizon: int,
+    *,
+    slots: int,
+    first: int,
+) -> Float[np.ndarray, " step"]:
+    """`prediction_error` of anything that imagines.
+
+    Args:
+        imagine: Predicts, from the past of some moments, what actions [start, horizon, action]
+            lead to; it may use the true simulator parameters.
+        trajectories: Real episodes.
+        horizon: Imagined steps.
+        slots: Past transitions that `imagine` is given; fewer where an episode is younger.
+        first: Steps of an episode before the first moment.
+    """
+    starts = [(t, s) for t in trajectories for s in range(first, len(t) - horizon + 1)]
     if not starts:
         return np.zeros(0)
     starts = [starts[i] for i in np.linspace(0, len(starts) - 1, NUM_STARTS, dtype=int)]
     std = np.concatenate([t.obs for t in trajectories]).std(0)
 
-    def cut(before: int, after: int, shift: int, name: str):
-        rows = [getattr(t, name)[s - before + shift : s + after + shift] for t, s in starts]
-        return jnp.asarray(np.stack(rows))
+    def past(shift: int, name: str):
+        rows = [getattr(t, name)[max(s - slots, 0) + shift : s + shift] for t, s in starts]
+        missing = [((slots - len(row), 0), (0, 0)) for row in rows]
+        return jnp.asarray(np.stack([np.pad(*pair) for pair in zip(rows, missing, strict=True)]))
 
-    recent = RecentTransitions(
-        cut(slots, 0, 0, "obs"),
-        cut(slots, 0, 0, "action"),
-        cut(slots, 0, 1, "obs"),
-        jnp.full(len(starts), slots, jnp.int32),
-    )
-    truth = cut(0, horizon, 1, "obs")
-    physics, names = None, agent.model.sim_param_names
-    if names:
-        physics = jnp.asarray(np.stack([sim_params_row(t.sim_params, names) for t, _ in starts]))
-    imagined = _imagine(agent, recent, physics, cut(0, horizon, 0, "action"), key)
-    scaled = (np.asarray(imagined) - np.asarray(truth)) / np.where(std > 1e-6, std, np.inf)
+    def future(shift: int, name: str):
+        return np.stack([getattr(t, name)[s + shift : s + horizon + shift] for t, s in starts])
+
+    count = jnp.asarray([min(s, slots) for _, s in starts], jnp.int32)
+    recent = RecentTransitions(past(0, "obs"), past(0, "action"), past(1, "obs"), count)
+    truth = future(1, "obs")
+    physics = [trajectory.sim_params for trajectory, _ in starts]
+    imagined = imagine(recent, jnp.asarray(future(0, "action")), physics)
+    scaled = (np.asarray(imagined) - truth) / np.where(std > 1e-6, std, np.inf)
     return np.sqrt(np.square(scaled).mean((0, 1, 3)))
 
 

@@ -23,6 +23,8 @@ class Method:
     name: str
     description: str
     settings: Settings
+    by_preset: Mapping[str, Settings] = dataclasses.field(default_factory=dict)
+    """What replaces some of them in a preset, by its name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,6 +147,33 @@ _METHODS = (
         },
     ),
     Method(
+        "grbal",
+        "one network that a gradient step adapts online (Nagabandi et al., 2019)",
+        {
+            **_PLAIN,
+            "model.kind": "gradient-adapted",
+            "model.hidden_sizes": (512, 512, 512),
+        },
+        {
+            "quick": {"model.hidden_sizes": (128, 128, 128)},
+            "smoke": {"model.hidden_sizes": (16, 16)},
+        },
+    ),
+    Method(
+        "rebal",
+        "one recurrent network that remembers the episode (Nagabandi et al., 2019)",
+        {
+            **_PLAIN,
+            "model.kind": "recurrent",
+            "model.hidden_sizes": (256,),
+            "fitting.learning_rate": 1e-2,
+        },
+        {
+            "quick": {"model.hidden_sizes": (128,)},
+            "smoke": {"model.hidden_sizes": (16,)},
+        },
+    ),
+    Method(
         "random",
         "uniform random actions; nothing is learned",
         {**_PLAIN, **_ONLY_A_TEST, "model.kind": "none"},
@@ -152,7 +181,7 @@ _METHODS = (
     Method(
         "true-dynamics",
         "the same planner on the real simulator: the environment's ceiling",
-        {**_PLAIN, **_ONLY_A_TEST, "model.kind": "simulator"},
+        {**_PLAIN, **_ONLY_A_TEST, "model.kind": "simulator", "planner.reward": "task"},
     ),
 )
 
@@ -261,7 +290,12 @@ def make_config(
     for name in ("env", "method", "preset", "seed"):
         if name in (settings or {}):
             raise ConfigError(f"{name} is no setting to override; pass it as {name}=... instead.")
-    named = {**PRESETS[preset].settings(spec), **METHODS[method].settings}
+    chosen = METHODS[method]
+    named = {
+        **PRESETS[preset].settings(spec),
+        **chosen.settings,
+        **chosen.by_preset.get(preset, {}),
+    }
     start = Config(env=spec.name, method=method, preset=preset)
     config = override(start, {**named, "seed": seed, **(settings or {})})
     check_options(config)

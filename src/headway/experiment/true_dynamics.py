@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import io_callback
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.config import PlannerConfig
@@ -194,7 +195,7 @@ class ClassicDynamics(eqx.Module):
 
 
 class RobotSimulator:
-    """MuJoCo's threaded rollout; the search runs step by step around it.
+    """MuJoCo's threaded rollout; the compiled search calls it for every iteration's candidates.
 
     Args:
         vector: The environments.
@@ -206,29 +207,32 @@ class RobotSimulator:
         self.task = task
         self._planner = planner
         self._futures = RobotFutures(vector)
+        self._plan = jax.jit(self._search)
 
     def plan(self, search: SearchState, key: PRNGKeyArray) -> Plan:
         """See `Simulator.plan`."""
-        with jax.disable_jit():  # MuJoCo scores concrete numbers
-            optimizer = make_optimizer(self._planner)
-            return optimizer.optimize(lambda found, _: self.returns(found), search, key=key)
+        return jax.block_until_ready(self._plan(search, key))  # before the environments step on
+
+    def _search(self, search: SearchState, key: PRNGKeyArray) -> Plan:
+        def score(candidates, key):
+            del key
+            shape = jax.ShapeDtypeStruct(candidates.shape[:2], jnp.float32)
+            # No pure function, because the environments move: it must run every time.
+            return io_callback(self.returns, shape, candidates, ordered=True)
+
+        return make_optimizer(self._planner).optimize(score, search, key=key)
 
     def returns(
-        self, candidates: Float[Array, "env candidate horizon action"]
-    ) -> Float[Array, "env candidate"]:
+        self, candidates: Float[Array | np.ndarray, "env candidate horizon action"]
+    ) -> Float[np.ndarray, "env candidate"]:
         """Sums of rewards; not finite where MuJoCo gives up on a candidate."""
         actions = env_action(self.task, np.asarray(candidates)).astype(np.float64)
         found = [self._of_env(i, sequences) for i, sequences in enumerate(actions)]
-        return jnp.asarray(np.stack(found), jnp.float32)
+        return np.stack(found).astype(np.float32)
 
     def _of_env(
         self, i: int, actions: Float[np.ndarray, "candidate horizon action"]
     ) -> Float[np.ndarray, " candidate"]:
         world = self._futures.vector.world
         before, after = self._futures.roll_out(i, actions)
-        if self._planner.reward == "released":
-            obs, next_obs = world.observe(before), world.observe(after)
-            rewards = np.asarray(self.task.released_reward(obs, actions, next_obs))
-        else:
-            rewards = world.reward(before, actions, after)
-        return rewards.sum(-1)
+        return world.reward(before, actions, after).sum(-1)

@@ -27,11 +27,18 @@ def plan_flop(
 
 
 def step_flop(model: ModelConfig, planner: PlannerConfig, task: Task) -> float:
-    """Operations of one particle's step: the backbone, one mean head, the variance heads.
+    """Operations of one particle's step, which depend on the kind of model.
 
-    The mean heads of an average are folded into one; their variances are not.
+    Multi-headed: the backbone, one mean head, the variance heads. The mean heads of an average
+    are folded into one; their variances are not. Recurrent: four gates per unit. Where nothing
+    is learned there are no networks.
     """
+    if model.kind in ("simulator", "none"):
+        return 0.0
     heads_of_variance = model.num_heads if planner.head_selection == "average" else 1
     outputs = 1 + (0 if model.deterministic else heads_of_variance)
-    sizes = (task.feature_size + task.action_size, *model.hidden_sizes, outputs * task.obs_size)
-    return float(2 * sum(n * m for n, m in itertools.pairwise(sizes)))
+    sizes = (task.feature_size + task.action_size, *model.hidden_sizes)
+    products = [n * m for n, m in itertools.pairwise(sizes)]
+    if model.kind == "recurrent":
+        products = [4 * (n + m) * m for n, m in itertools.pairwise(sizes)]
+    return float(2 * (sum(products) + sizes[-1] * outputs * task.obs_size))

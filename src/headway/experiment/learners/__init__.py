@@ -1,6 +1,7 @@
 """The kinds of models that a run can train, behind one interface; `model.kind` chooses."""
 
 from headway.config import Config
+from headway.experiment.learners.adaptive import GradientAdaptation, Recurrence
 from headway.experiment.learners.base import Fit as Fit
 from headway.experiment.learners.base import Learned as Learned
 from headway.experiment.learners.base import Learner as Learner
@@ -10,6 +11,8 @@ from headway.tasks.base import Task
 
 _LEARNERS: dict[str, type[Learner]] = {
     "multi-headed": MultiHeaded,
+    "gradient-adapted": GradientAdaptation,
+    "recurrent": Recurrence,
     "simulator": Simulator,
     "none": Random,
 }

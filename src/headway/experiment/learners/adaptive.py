@@ -1,0 +1,152 @@
+"""Models that change while they act: GrBAL's and ReBAL's."""
+
+import abc
+import itertools
+from collections.abc import Sequence
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from headway.data import Trajectory
+from headway.experiment.blocks import BlockedData, Layout, fit_each
+from headway.experiment.diagnostics import imagined_error
+from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
+from headway.experiment.rollouts import Arena
+from headway.models.adapted import MetaSetup, ReluNet, meta_epoch
+from headway.models.dynamics import Statistics
+from headway.models.fitting import EpochStats, FitData, FitSetup
+from headway.models.recurrent import RecurrentNet, RecurrentSetup, recurrent_epoch
+from headway.models.updates import Fitted
+from headway.planning.adaptive import AdaptiveModel, GradientAdapted, Recurrent
+from headway.planning.adaptive_agent import AdaptiveAgent, imagine
+
+
+class Adaptive(Learner):
+    """One network that is fitted by a procedure of its own to the data that T-MCL has."""
+
+    @abc.abstractmethod
+    def draw_net(self, key: PRNGKeyArray) -> Any:
+        """Initial weights."""
+
+    @abc.abstractmethod
+    def fit_block(
+        self, state: Fitted, data: FitData, key: PRNGKeyArray
+    ) -> tuple[Fitted, EpochStats]:
+        """Go once through a block of data."""
+
+    @abc.abstractmethod
+    def acting_model(self, learned: Learned) -> AdaptiveModel:
+        """The model as it acts."""
+
+    @property
+    @abc.abstractmethod
+    def memory_length(self) -> int:
+        """Past transitions that the model's state can depend on."""
+
+    def initial(self, key: PRNGKeyArray) -> Learned:
+        """See `Learner.initial`."""
+        state = Fitted.new(self.draw_net(key), self.config.fitting.learning_rate)
+        return Learned(state, Statistics.identity(self.task, self.config.model.history_length))
+
+    def fit(self, trajectories: list[Trajectory], iteration: int, key: PRNGKeyArray) -> Fit:
+        """See `Learner.fit`."""
+        del iteration
+        fitting, history_length = self.config.fitting, self.config.model.history_length
+        statistics = Statistics.fit(self.task, trajectories, history_length)
+        layout = Layout.of(self.config, self.episode_length)
+        setup = FitSetup(self.task, fitting, history_length)
+        data = BlockedData(trajectories, layout, statistics, setup, num_members=1, key=key)
+
+        def epochs(state: Fitted, first: int) -> Epochs:
+            with closing(data.stream(fitting.epochs, key, first=first)) as blocks:
+                for _ in range(first, fitting.epochs):
+                    of_epoch = itertools.islice(blocks, data.num_blocks)
+                    state, stats = fit_each(state, of_epoch, self.fit_block)
+                    yield state, stats
+
+        return Fit(statistics, epochs)
+
+    def agent(
+        self,
+        learned: Learned,
+        arena: Arena | None = None,
+        trajectories: Sequence[Trajectory] = (),
+    ) -> AdaptiveAgent:
+        """See `Learner.agent`."""
+        del arena, trajectories
+        return AdaptiveAgent(self.acting_model(learned), self.task, self.config.planner)
+
+    def prediction_error(
+        self, learned: Learned, trajectories: list[Trajectory], key: PRNGKeyArray
+    ) -> Float[np.ndarray, " step"]:
+        """See `Learner.prediction_error`."""
+        del key
+        planner, agent = self.config.planner, self.agent(learned)
+        # The same moments as for models with heads, whatever this one remembers.
+        first = max(self.config.model.history_length, planner.selection_length)
+        return imagined_error(
+            lambda recent, actions, _: imagine(agent, recent, actions),
+            trajectories,
+            planner.horizon,
+            slots=self.memory_length,
+            first=first,
+        )
+
+
+class GradientAdaptation(Adaptive):
+    """GrBAL: weights from which one gradient step adapts (fact sheet E.9)."""
+
+    @property
+    def setup(self) -> MetaSetup:
+        """What fixes the compiled epoch."""
+        model = self.config.model
+        length, rate = model.adaptation_length, model.adaptation_rate
+        return MetaSetup(self.task, self.config.fitting, length, rate)
+
+    @property
+    def memory_length(self) -> int:
+        """See `Adaptive.memory_length`."""
+        return self.config.model.adaptation_length
+
+    def draw_net(self, key: PRNGKeyArray) -> ReluNet:
+        """See `Adaptive.draw_net`."""
+        return ReluNet.init(self.config.model, self.task, key=key)
+
+    def fit_block(
+        self, state: Fitted, data: FitData, key: PRNGKeyArray
+    ) -> tuple[Fitted, EpochStats]:
+        """See `Adaptive.fit_block`."""
+        return meta_epoch(state, self.setup, data, key=key)
+
+    def acting_model(self, learned: Learned) -> GradientAdapted:
+        """See `Adaptive.acting_model`."""
+        setup = self.setup
+        return GradientAdapted(
+            learned.fit.model, learned.statistics, self.task, setup.length, setup.rate
+        )
+
+
+class Recurrence(Adaptive):
+    """ReBAL: a recurrent network (fact sheet E.10)."""
+
+    @property
+    def memory_length(self) -> int:
+        """See `Adaptive.memory_length`; the whole episode."""
+        return self.episode_length
+
+    def draw_net(self, key: PRNGKeyArray) -> RecurrentNet:
+        """See `Adaptive.draw_net`."""
+        return RecurrentNet.init(self.config.model, self.task, key=key)
+
+    def fit_block(
+        self, state: Fitted, data: FitData, key: PRNGKeyArray
+    ) -> tuple[Fitted, EpochStats]:
+        """See `Adaptive.fit_block`."""
+        setup = RecurrentSetup(self.task, self.config.fitting)
+        return recurrent_epoch(state, setup, data, key=key)
+
+    def acting_model(self, learned: Learned) -> Recurrent:
+        """See `Adaptive.acting_model`."""
+        return Recurrent(learned.fit.model, learned.statistics, self.task)

@@ -1,0 +1,205 @@
+"""The simulator as a model: it imagines what the environments do, and nothing else."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import headway
+from headway.envs.vector_worlds import ClassicVectorEnv, RolloutVectorEnv
+from headway.errors import ConfigError
+from headway.experiment import training
+from headway.experiment.methods import make_config
+from headway.experiment.rollouts import Arena
+from headway.experiment.true_dynamics import (
+    ClassicDynamics,
+    RobotSimulator,
+    make_simulator,
+)
+from headway.planning.controller import env_action
+from headway.planning.returns import RolloutSettings, candidate_returns
+from headway.tasks.catalog import env_names, env_spec
+
+CLASSIC = ["pendulum", "cartpole-swingup"]
+ROBOTS = ["hopper", "slim-humanoid", "half-cheetah", "crippled-ant"]
+SHORT = {"collection.episode_length": 6}
+SMALL = {"planner.num_candidates": 6, "planner.num_elites": 2, "planner.horizon": 5}
+
+
+def every_physics(env):
+    sets = env_spec(env).sim_params
+    return [values for group in sets.group_names for values in sets.group(group)]
+
+
+def begin(env, physics, *, steps=7):
+    """An arena with one environment per physics, some random steps into an episode."""
+    settings = {"collection.num_episodes": len(physics), **SMALL}
+    config = make_config(env, method="true-dynamics", preset="smoke", settings=settings)
+    arena = Arena.make(config)
+    columns = {name: np.array([values[name] for values in physics]) for name in physics[0]}
+    arena.vector.reset(seed=[*range(len(physics))], options={"sim_params": columns})
+    rng = np.random.default_rng(3)
+    for _ in range(steps):
+        arena.vector.step(random_actions(arena, rng))
+    return config, arena
+
+
+def random_actions(arena, rng):
+    shape = (arena.vector.num_envs, arena.task.action_size)
+    return env_action(arena.task, rng.uniform(-1, 1, shape).astype(np.float32))
+
+
+def play(arena, sequence):
+    """What the environments themselves pay for [env, horizon, action], in [-1, 1]."""
+    total = np.zeros(arena.vector.num_envs)
+    for step in range(sequence.shape[1]):
+        actions = env_action(arena.task, sequence[:, step])
+        total += arena.vector.step(actions)[1]
+    return total
+
+
+@pytest.mark.parametrize("env", CLASSIC)
+def test_compiled_equations_step_as_the_environment_under_every_physics(env):
+    physics = every_physics(env)
+    _, arena = begin(env, physics)
+    vector = arena.vector
+    assert isinstance(vector, ClassicVectorEnv)
+    rng = np.random.default_rng(0)
+    sim_params = {k: jnp.asarray(v, jnp.float32) for k, v in vector.sim_params.items()}
+    step = jax.jit(lambda s, a: vector.world.next_state(s, a, sim_params, jnp))
+    for _ in range(12):
+        before = vector.states
+        actions = random_actions(arena, rng)
+        obs = vector.step(actions)[0]
+        found = step(jnp.asarray(before, jnp.float32), jnp.asarray(actions))
+        # Numbers of up to a few hundred in single precision, amplified by light masses.
+        np.testing.assert_allclose(found, vector.states, rtol=3e-6, atol=3e-5)
+        np.testing.assert_allclose(vector.world.observe(found, jnp), obs, rtol=3e-6, atol=3e-5)
+
+
+@pytest.mark.parametrize("env", CLASSIC)
+def test_imagined_returns_of_the_equations_are_what_the_environment_pays(env):
+    config, arena = begin(env, every_physics(env))
+    vector, task = arena.vector, arena.task
+    assert isinstance(vector, ClassicVectorEnv)
+    sequences = np.random.default_rng(1).uniform(-1, 1, (vector.num_envs, 3, 9, 1))
+    candidates = jnp.asarray(sequences, jnp.float32)
+    states = jnp.asarray(vector.states, jnp.float32)
+    sim_params = {k: jnp.asarray(v, jnp.float32) for k, v in vector.sim_params.items()}
+    found = candidate_returns(
+        ClassicDynamics(states, sim_params, vector.world),
+        task,
+        vector.world.observe(states, jnp),
+        candidates,
+        settings=RolloutSettings.of(config.planner, 1),
+        key=jax.random.key(0),
+    )
+    paid = play(arena, np.asarray(candidates[:, 1]))
+    np.testing.assert_allclose(found[:, 1], paid, rtol=1e-4)
+    assert np.abs(found[:, 0] - paid).min() > 1e-4
+
+
+@pytest.mark.parametrize("env", ROBOTS)
+def test_imagined_returns_of_robots_are_what_the_environment_pays_to_the_bit(env):
+    config, arena = begin(env, every_physics(env))
+    simulator = make_simulator(arena, config.planner)
+    assert isinstance(simulator, RobotSimulator)
+    shape = (arena.vector.num_envs, 3, 6, arena.task.action_size)
+    candidates = np.random.default_rng(1).uniform(-1, 1, shape).astype(np.float32)
+    found = np.asarray(simulator.returns(candidates))
+    again = np.asarray(simulator.returns(candidates))
+    paid = play(arena, candidates[:, 1])
+    np.testing.assert_array_equal(found, again)
+    np.testing.assert_allclose(found[:, 1], paid, rtol=1e-6)
+    assert np.abs(found[:, 0] - paid).min() > 1e-4
+
+
+def test_a_robot_that_mujoco_gives_up_on_ranks_last():
+    config, arena = begin("half-cheetah", every_physics("half-cheetah")[:1])
+    vector = arena.vector
+    assert isinstance(vector, RolloutVectorEnv)
+    vector._state[0, 0, 5] = 1e12  # beyond what MuJoCo accepts
+    simulator = make_simulator(arena, config.planner)
+    candidates = np.zeros((1, 2, 4, arena.task.action_size), np.float32)
+    assert not np.isfinite(simulator.returns(candidates)).any()
+
+
+@pytest.mark.parametrize("env", env_names())
+def test_smoke_run_of_the_simulator_is_only_a_test(env, tmp_path):
+    run = headway.train(
+        env, method="true-dynamics", preset="smoke", run_dir=tmp_path, settings=SMALL | SHORT
+    )
+    groups = env_spec(env).sim_params.group_names
+    assert [row.group for row in run.evaluation] == [g for g in groups for _ in range(2)]
+    assert [metrics["timesteps"] for metrics in run.metrics] == [0]
+    assert [path.name for path in run.figures] == ["evaluation.png"]
+
+
+def test_a_run_on_the_simulator_can_be_tested_again(tmp_path):
+    headway.train(
+        "pendulum", method="true-dynamics", preset="smoke", run_dir=tmp_path, settings=SMALL | SHORT
+    )
+    again = headway.evaluate(tmp_path, groups=["train"], num_episodes=1)
+    assert len(again) == 1
+    assert (again.cost.evaluations_per_step, again.cost.flop_per_step) == (2 * 6, 0)
+
+
+def test_an_interrupted_test_on_the_simulator_goes_on_to_the_same_end(tmp_path, monkeypatch):
+    settings = SMALL | SHORT
+    config = make_config("hopper", method="true-dynamics", preset="smoke", settings=settings)
+    training.train_run(config, tmp_path / "whole")
+    act, calls = training.AgentPolicy.__call__, []
+
+    def interrupted(self, obs):
+        calls.append(obs)
+        if len(calls) == 9:  # in the second batch
+            raise KeyboardInterrupt
+        return act(self, obs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("headway.experiment.progress_store.EVERY", 0)
+        patch.setattr(training.AgentPolicy, "__call__", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            training.train_run(config, tmp_path / "cut")
+    training.train_run(config, tmp_path / "cut")
+    ends = [(tmp_path / name / "evaluation.csv").read_text() for name in ("whole", "cut")]
+    assert ends[0] == ends[1]
+
+
+def test_the_simulator_beats_random_actions(tmp_path):
+    settings = {"planner.horizon": 15, "planner.num_candidates": 60, "planner.num_elites": 10}
+    settings |= {"collection.episode_length": 100, "collection.num_episodes": 8}
+    returns = {}
+    for method, changes in (("random", {}), ("true-dynamics", settings)):
+        changes = {"collection.episode_length": 100, **changes}
+        run = headway.train(
+            "pendulum", method=method, preset="smoke", run_dir=tmp_path / method, settings=changes
+        )
+        returns[method] = np.mean([row.episode_return for row in run.evaluation])
+    assert returns["true-dynamics"] > 0.6 * returns["random"]  # both are negative
+
+
+def test_random_actions_are_uniform_within_bounds_and_have_no_heads(tmp_path):
+    headway.train("pendulum", method="random", preset="smoke", run_dir=tmp_path, settings=SHORT)
+    controller = headway.load(tmp_path)
+    actions = np.array([controller.act(np.zeros(3))[0] for _ in range(400)])
+    assert controller.heads is None
+    assert np.abs(actions).max() <= 2.0
+    assert abs(actions.mean()) < 0.2
+    np.testing.assert_allclose(actions.std(), 2 / np.sqrt(3), rtol=0.1)
+
+
+def test_a_run_on_the_simulator_has_no_controller_to_load(tmp_path):
+    headway.train(
+        "pendulum", method="true-dynamics", preset="smoke", run_dir=tmp_path, settings=SHORT
+    )
+    with pytest.raises(ConfigError, match=r"no controller of its own, allowed:"):
+        headway.load(tmp_path)
+
+
+def test_the_simulator_wants_one_particle_and_the_reward_that_is_paid():
+    with pytest.raises(ConfigError, match=r"num_particles is 2, allowed: 1"):
+        make_config("pendulum", method="true-dynamics", settings={"planner.num_particles": 2})
+    with pytest.raises(ConfigError, match=r"planner\.reward is 'released', allowed: task"):
+        make_config("pendulum", method="true-dynamics", settings={"planner.reward": "released"})
+    assert make_config("pendulum", method="true-dynamics", preset="released-code")
