@@ -201,7 +201,7 @@ class ImaginedDynamics(eqx.Module):
         out = self.heads.layer(x)
         obs_size = self.delta_std.shape[0]
         mean = out[:, :obs_size]
-        low, high, doubt = self.heads[1:]
+        low, high, doubt = self.heads.min_logvar, self.heads.max_logvar, self.heads.doubt
         if noise is None:
             return mean
         std = jnp.zeros(())
