@@ -32,9 +32,9 @@ class Run:
     figures: list[Path]
     """The figures made after training."""
 
-    def controller(self, *, seed: int = 0) -> Controller:
-        """The trained controller."""
-        return load(self.path, seed=seed)
+    def controller(self, *, seed: int = 0, **options: Any) -> Controller:
+        """The trained controller; options are those of `Controller`."""
+        return load(self.path, seed=seed, **options)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,17 +138,18 @@ def evaluate(
     return Evaluation(rows, tested.config, cost)
 
 
-def load(run_dir: str | Path, *, seed: int = 0) -> Controller:
+def load(run_dir: str | Path, *, seed: int = 0, **options: Any) -> Controller:
     """Load the controller of a run.
 
     Args:
         run_dir: The run directory.
         seed: Seeds the planner's draws.
+        options: Those of `Controller`, for example `deadline_ms=50`.
 
     Raises:
         RunError: There is no trained run, or it is damaged.
     """
-    return Controller(load_agent(RunDir(run_dir)), seed=seed)
+    return Controller(load_agent(RunDir(run_dir)), seed=seed, **options)
 
 
 def default_run_dir(config: Config) -> Path:

@@ -40,6 +40,10 @@ class DivergenceError(HeadwayError, ArithmeticError):
     """Fitting produced non-finite numbers that could not be repaired."""
 
 
+class PlanningError(HeadwayError, RuntimeError):
+    """A controller cannot say what to do next, and has no earlier plan left to go on with."""
+
+
 class LimitError(HeadwayError, RuntimeError):
     """The machine lacks the memory or the disk that a run needs."""
 

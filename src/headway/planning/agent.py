@@ -26,7 +26,7 @@ from headway.planning.learning import (
     heads_by_evidence,
     learn,
 )
-from headway.planning.optimizers import SearchState, make_optimizer, where_env
+from headway.planning.optimizers import Plan, Score, SearchState, make_optimizer, where_env
 from headway.planning.returns import RolloutSettings, candidate_returns
 from headway.tasks.base import Task
 
@@ -131,9 +131,19 @@ class Agent(eqx.Module):
         return act(self, state, jnp.asarray(obs, jnp.float32))
 
 
-def _act(
-    agent: Agent, state: AgentState, obs: Float[Array, "env obs"]
-) -> tuple[AgentState, Decision]:
+class Prepared(NamedTuple):
+    """All that is known in a step before its search."""
+
+    recent: RecentTransitions
+    learned: LastLayer | None
+    heads: Int[Array, "env member"]
+    dynamics: ImaginedDynamics
+    key: PRNGKeyArray
+    plan_key: PRNGKeyArray
+
+
+def prepare(agent: Agent, state: AgentState, obs: Float[Array, "env obs"]) -> Prepared:
+    """Everything of a step that comes before its search."""
     key, head_key, error_key, plan_key = jax.random.split(state.key, 4)
     # 1. Remember the transition that the last action caused.
     recent = state.recent.push(state.obs, state.action, obs, state.acted)
@@ -145,7 +155,6 @@ def _act(
     heads = choose_heads(
         agent, recent, context, error_key=error_key, head_key=head_key, learned=learned
     )
-    # 5. Imagine candidates with it, and search for the best action sequence.
     chosen, layer = planning_heads(agent, heads), learned.layer
     dynamics = ImaginedDynamics.fold(
         agent.model,
@@ -156,20 +165,41 @@ def _act(
         correction=None if layer is None else layer.weight,
         doubt=None if layer is None else doubt(agent, layer, chosen, context),
     )
+    return Prepared(recent, learned, heads, dynamics, key, plan_key)
+
+
+def scoring(agent: Agent, dynamics: ImaginedDynamics, obs: Float[Array, "env obs"]) -> Score:
+    """Returns of candidates, imagined from where each environment is now."""
     settings = RolloutSettings.of(agent.planner, agent.model.num_members)
 
     def score(candidates, key):
         return candidate_returns(dynamics, agent.task, obs, candidates, settings=settings, key=key)
 
-    optimizer = make_optimizer(agent.planner)
-    plan = optimizer.optimize(score, state.search, key=plan_key)
-    # 6. Take the first action; where the search ended, one step later, is the next start.
+    return score
+
+
+def decide(
+    agent: Agent, state: AgentState, obs: Float[Array, "env obs"], prepared: Prepared, plan: Plan
+) -> tuple[AgentState, Decision]:
+    """Take a plan's first action; where its search ended, one step later, is the next start."""
+    recent, learned, heads, _, key, _ = prepared
     action = plan.actions[:, 0]
     acted = jnp.ones_like(state.acted)
-    search = optimizer.shift(plan.state)
+    search = make_optimizer(agent.planner).shift(plan.state)
     state = AgentState(recent, obs, action, acted, search, key, learned, state.sim_params)
     decision = Decision(action, heads, plan.failures, plan.evaluations)
     return whole_on_each((state, decision), agent.planner.devices)
+
+
+def _act(
+    agent: Agent, state: AgentState, obs: Float[Array, "env obs"]
+) -> tuple[AgentState, Decision]:
+    prepared = prepare(agent, state, obs)
+    # Imagine candidates, and search for the best action sequence.
+    score = scoring(agent, prepared.dynamics, obs)
+    optimizer = make_optimizer(agent.planner)
+    plan = optimizer.optimize(score, state.search, key=prepared.plan_key)
+    return decide(agent, state, obs, prepared, plan)
 
 
 _act_float32 = jit_networks(_act)
@@ -232,3 +262,13 @@ def reset_where(state: AgentState, fresh: AgentState, done: Bool[Array, " env"])
     """Forget everything about the environments where an episode begins anew."""
     kept = where_env(done, fresh._replace(key=None), state._replace(key=None))
     return kept._replace(key=state.key)
+
+
+def hold(agent: Agent, state: AgentState) -> AgentState:
+    """Go on along the last plan without a look: its next action is the state's `action`.
+
+    The transition that the action causes is not remembered, because it begins unseen.
+    """
+    search = make_optimizer(agent.planner).shift(state.search)
+    unseen = jnp.zeros_like(state.acted)
+    return state._replace(action=state.search.guess[:, 0], acted=unseen, search=search)

@@ -1,28 +1,79 @@
 """One robot's controller: observations in, actions out, in the environment's own units."""
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
-from headway.errors import ConfigError
+from headway.errors import ConfigError, PlanningError, shown
 from headway.planning.acting import Acting
+from headway.planning.agent import Agent, hold
+from headway.planning.checking import RangeCheck, not_finite
+from headway.planning.deadline import DeadlinePlanner
 from headway.tasks.base import Task
+
+
+class Status(NamedTuple):
+    """How an action was found."""
+
+    outcome: Literal["planned", "deadline", "held"]
+    """`planned`: the search ended. `deadline`: it was cut off, and the action is the best so far.
+    `held`: there is no new plan, and the action is the next one of the plan before."""
+    reason: str
+    """Why the search was cut off or failed; empty where it ended."""
+    warnings: tuple[str, ...]
+    """What of the observation is unlike the training data."""
+    iterations: int
+    """Iterations of the planner."""
+    seconds: float
+    """From the call of `act` to the action."""
 
 
 class Controller:
     """Acts with a trained agent, one step at a time.
 
+    An observation of the wrong shape is an error. One that is not finite is not: the robot must
+    go on, so the controller holds to its last plan, as it does where planning finds nothing
+    finite or no iteration fits the deadline. A plan lasts `planner.horizon` steps; a controller
+    that has none left raises. An observation unlike the training data is planned with, and
+    `status.warnings` says what is off.
+
     Args:
         agent: The trained agent.
         seed: Seeds the planner's draws.
+        deadline_ms: Milliseconds after which `act` answers with the best plan so far; None plans
+            to the end. Everything is compiled and timed first, while the controller is built.
+            Where no earlier plan is left, as in the first step, one iteration is made even if
+            it is late. The promise is that of a program in Python: `status.seconds` has what a
+            step took, with any pause of the system.
+        max_deviations: Standard deviations from the mean of the training data at which a feature
+            of an observation is reported; None does not look.
+
+    Raises:
+        ConfigError: The deadline is not positive, or the agent cannot plan to a deadline.
     """
 
-    def __init__(self, agent: Acting, *, seed: int = 0):
+    def __init__(
+        self,
+        agent: Acting,
+        *,
+        seed: int = 0,
+        deadline_ms: float | None = None,
+        max_deviations: float | None = 10.0,
+    ):
         self.agent = agent
         self._seed = seed
         self._episode = -1
+        self._range = self._deadline = None
+        if isinstance(agent, Agent) and max_deviations is not None:
+            self._range = RangeCheck(agent.task, agent.statistics.features, max_deviations)
+        if deadline_ms is not None:
+            self._deadline = self._planner_to(deadline_ms)
         self.reset()
 
     def reset(self, sim_params: Mapping[str, float] | None = None) -> None:
@@ -37,46 +88,63 @@ class Controller:
         """
         self._episode += 1
         key = jax.random.fold_in(jax.random.key(self._seed), self._episode)
-        self._state = None
+        self._state: Any = None
         if sim_params is not None or not self.agent.sim_param_names:
             self._state = self.agent.init(1, key=key, sim_params=[sim_params or {}])
         self._heads: Int[np.ndarray, " member"] | None = None
+        self._status: Status | None = None
+        self._left = 0  # steps of the last plan that are still to come
 
-    def act(self, obs: Float[np.ndarray, " obs"]) -> Float[np.ndarray, " action"]:
+    def act(self, obs: ArrayLike) -> Float[np.ndarray, " action"]:
         """Choose the next action.
 
         Args:
-            obs: The observation, as the environment returned it.
+            obs: The observation, as the environment returned it; one number per entry.
 
         Returns:
             The action, in the environment's own units and within its bounds.
 
         Raises:
-            ConfigError: The observation has another shape or is not finite, or the model wants
-                to be told the simulator parameters and was not.
+            ConfigError: The observation has another shape, or the model wants to be told the
+                simulator parameters and was not.
+            PlanningError: There is no new plan, and no earlier one is left.
         """
-        if self._state is None:
-            names = ", ".join(self.agent.sim_param_names)
-            raise ConfigError(
-                f"the controller was told no sim_params, allowed: a value for each of {names},"
-                ' which its model takes as input; call reset(sim_params=info["sim_params"]) first.'
+        started = time.perf_counter()
+        entries = self._checked(obs)
+        problem = not_finite(entries)
+        if problem is not None:
+            return self._hold(f"{problem}; check the sensor", started)
+        warnings = self._range(entries) if self._range else ()
+        if self._deadline is None:
+            self._state, decision = self.agent.act(self._state, entries[None])
+            done, complete = self._num_iterations, True
+        else:
+            at_least = 0 if self._left > 0 else 1  # there is nothing else to do
+            self._state, decision, done, complete = self._deadline.act(
+                self._state, entries[None], started, at_least
             )
-        task = self.agent.task
-        obs = np.asarray(obs)
-        if obs.shape != (task.obs_size,):
-            raise ConfigError(
-                f"obs has shape {obs.shape}, allowed: ({task.obs_size},); pass one observation as"
-                " the environment returns it."
-            )
-        if not np.isfinite(obs).all():
-            entry = int(np.argmin(np.isfinite(obs)))
-            raise ConfigError(
-                f"obs[{entry}] is {obs[entry]}, allowed: finite numbers; check the sensor."
-            )
-        self._state, decision = self.agent.act(self._state, obs[None].astype(np.float32))
-        scaled, heads = jax.device_get((decision.action, decision.heads))
+        scaled, heads, failures = jax.device_get(
+            (decision.action[0], decision.heads, decision.failures[0])
+        )
         self._heads = None if heads is None else heads[0]
-        return env_action(task, scaled[0])
+        failures = int(failures)
+        reason = ""
+        if done == 0:
+            reason = "no iteration of the planner fits the deadline"
+        elif failures >= done:
+            reason = f"none of {done} iterations of the planner found a finite return"
+        elif not complete:
+            reason = f"time was up after {done} of {self._num_iterations} iterations"
+        failed = done == 0 or failures >= done
+        self._count(failed, reason)
+        outcome = "held" if failed else "planned" if complete else "deadline"
+        self._status = Status(outcome, reason, warnings, done, time.perf_counter() - started)
+        return env_action(self.agent.task, scaled)
+
+    @property
+    def status(self) -> Status | None:
+        """How the last action was found; None before the first."""
+        return self._status
 
     @property
     def heads(self) -> Int[np.ndarray, " member"] | None:
@@ -88,6 +156,75 @@ class Controller:
         recent past best.
         """
         return self._heads
+
+    @property
+    def _num_iterations(self) -> int:
+        return self.agent.planner.num_iterations if isinstance(self.agent, Agent) else 1
+
+    def _planner_to(self, deadline_ms: float) -> DeadlinePlanner:
+        if not 0 < deadline_ms < float("inf"):
+            raise ConfigError(
+                f"deadline_ms is {deadline_ms}, allowed: milliseconds above 0, or None for none."
+            )
+        if not isinstance(self.agent, Agent):
+            raise ConfigError(
+                f"a {type(self.agent).__name__} cannot plan to a deadline, allowed: an agent that"
+                " was trained; pass deadline_ms=None."
+            )
+        planner = DeadlinePlanner(self.agent, deadline_ms / 1000)
+        planner.warm_up()
+        return planner
+
+    def _checked(self, obs: Any) -> np.ndarray:
+        """An observation of the right shape, of a controller that was told what it must be."""
+        if self._state is None:
+            names = ", ".join(self.agent.sim_param_names)
+            raise ConfigError(
+                f"the controller was told no sim_params, allowed: a value for each of {names},"
+                ' which its model takes as input; call reset(sim_params=info["sim_params"]) first.'
+            )
+        size = self.agent.task.obs_size
+        try:
+            with np.errstate(over="ignore"):  # what is too large becomes infinite
+                entries = np.asarray(obs).astype(np.float32)
+        except (TypeError, ValueError):
+            raise ConfigError(
+                f"obs is {shown(obs)}, allowed: {size} numbers; pass one observation as the"
+                " environment returns it."
+            ) from None
+        if entries.shape != (size,):
+            raise ConfigError(
+                f"obs has shape {entries.shape}, allowed: ({size},); pass one observation as the"
+                " environment returns it."
+            )
+        return entries
+
+    def _hold(self, reason: str, started: float) -> Float[np.ndarray, " action"]:
+        """The next action of the last plan."""
+        self._count(True, reason)
+        self._state = _held(self.agent, self._state)
+        scaled = jax.device_get(self._state.action[0])
+        self._status = Status("held", reason, (), 0, time.perf_counter() - started)
+        return env_action(self.agent.task, scaled)
+
+    def _count(self, held: bool, reason: str) -> None:
+        """Count how much of a plan is left.
+
+        Raises:
+            PlanningError: Nothing is.
+        """
+        if not held:
+            self._left = self.agent.planner.horizon - 1 if isinstance(self.agent, Agent) else 0
+        elif self._left <= 0:
+            raise PlanningError(
+                f"{reason}, and no earlier plan is left, allowed: to hold to a plan for at most"
+                " planner.horizon - 1 steps; stop the robot, then call reset()."
+            )
+        else:
+            self._left -= 1
+
+
+_held: Callable[[Any, Any], Any] = eqx.filter_jit(hold)
 
 
 def env_action(

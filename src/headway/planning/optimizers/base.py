@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -46,7 +46,13 @@ class Plan(NamedTuple):
 
 
 class Optimizer(eqx.Module):
-    """Searches for the action sequence of the highest return."""
+    """Searches for the action sequence of the highest return, iteration by iteration.
+
+    A search under way is a pytree of the optimizer's own; its plan may be taken after any
+    iteration.
+    """
+
+    num_iterations: eqx.AbstractVar[int]
 
     @property
     @abc.abstractmethod
@@ -58,6 +64,33 @@ class Optimizer(eqx.Module):
         return SearchState(jnp.zeros((num_envs, horizon, action_size)))
 
     @abc.abstractmethod
+    def begin(self, state: SearchState) -> Any:
+        """A search before its first iteration."""
+
+    @abc.abstractmethod
+    def iterate(self, score: Score, search: Any, key: PRNGKeyArray, iteration: int = 0) -> Any:
+        """Draw candidates, score them, learn from them.
+
+        Args:
+            score: Returns of candidates; a non-finite one ranks last.
+            search: The search so far.
+            key: Draws the candidates, and is handed on to `score`.
+            iteration: Which iteration; only its `kind` matters.
+        """
+
+    @abc.abstractmethod
+    def end(self, search: Any) -> Plan:
+        """The plan of a search as it is now."""
+
+    def kind(self, iteration: int) -> int:
+        """The first iteration that is compiled alike; by default all are."""
+        del iteration
+        return 0
+
+    def settled(self, search: Any) -> Bool[Array, " env"]:
+        """Where the search needs no further iteration; nowhere, by default."""
+        return jnp.zeros(len(self.end(search).actions), bool)
+
     def optimize(self, score: Score, state: SearchState, *, key: PRNGKeyArray) -> Plan:
         """Search for the best action sequence of every environment.
 
@@ -66,6 +99,12 @@ class Optimizer(eqx.Module):
             state: Where to start.
             key: Draws the candidates, and is handed on to `score`.
         """
+        search, _ = jax.lax.scan(
+            lambda search, key: (self.iterate(score, search, key), None),
+            self.begin(state),
+            jax.random.split(key, self.num_iterations),
+        )
+        return self.end(search)
 
     def shift(self, state: SearchState) -> SearchState:
         """Move a state on by one step of time; the new last action is zero."""

@@ -50,18 +50,21 @@ class CEM(Optimizer):
 
     def optimize(self, score: Score, state: SearchState, *, key: PRNGKeyArray) -> Plan:
         """See `Optimizer.optimize`."""
+        if not self.settle_tolerance:
+            return super().optimize(score, state, key=key)
         keys = jax.random.split(key, self.num_iterations)
-        search = self._start(state)
-        if self.settle_tolerance:
-            search = self._until_settled(score, search, keys)
-        else:
-            search, _ = jax.lax.scan(
-                lambda search, key: (self._iterate(score, search, key), None), search, keys
-            )
+        return self.end(self._until_settled(score, self.begin(state), keys))
+
+    def end(self, search: "_Search") -> Plan:
+        """See `Optimizer.end`."""
         actions = jnp.clip(search.mean, -1.0, 1.0)
         variance = search.var if self.warm_variance else None
         ended = SearchState(actions, variance)
         return Plan(actions, search.expected, search.failures, search.evaluations, ended)
+
+    def settled(self, search: "_Search") -> Bool[Array, " env"]:
+        """See `Optimizer.settled`."""
+        return search.settled
 
     def shift(self, state: SearchState) -> SearchState:
         """See `Optimizer.shift`; the new last step starts from `initial_std`."""
@@ -75,7 +78,8 @@ class CEM(Optimizer):
     ) -> Float[Array, "env horizon action"]:
         return jnp.full_like(guess, self.initial_std**2)
 
-    def _start(self, state: SearchState) -> "_Search":
+    def begin(self, state: SearchState) -> "_Search":
+        """See `Optimizer.begin`."""
         num_envs = len(state.guess)
         if state.variance is None:
             var = self._initial(state.guess)
@@ -95,12 +99,16 @@ class CEM(Optimizer):
 
         def iterate(carry):
             iteration, search = carry
-            found = self._iterate(score, search, keys[iteration])
+            found = self.iterate(score, search, keys[iteration])
             return iteration + 1, where_env(search.settled, search, found)
 
         return jax.lax.while_loop(unsettled, iterate, (0, search))[1]
 
-    def _iterate(self, score: Score, search: "_Search", key: PRNGKeyArray) -> "_Search":
+    def iterate(
+        self, score: Score, search: "_Search", key: PRNGKeyArray, iteration: int = 0
+    ) -> "_Search":
+        """See `Optimizer.iterate`."""
+        del iteration  # all are alike
         draw_key, score_key = jax.random.split(key)
         candidates = self._draw(search.mean, search.var, draw_key)
         returns = rank_non_finite_last(score(candidates, score_key))

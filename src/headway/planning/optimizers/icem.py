@@ -62,18 +62,30 @@ class ICEM(Optimizer):
 
     def optimize(self, score: Score, state: SearchState, *, key: PRNGKeyArray) -> Plan:
         """See `Optimizer.optimize`."""
-        search = self._start(state)
-        keys = jax.random.split(key, self.num_iterations)
-        for iteration, population in enumerate(self.populations):
-            draw_key, score_key = jax.random.split(keys[iteration])
-            candidates = self._candidates(search, population, draw_key)
-            if iteration == self.num_iterations - 1:
-                candidates = jnp.concatenate([candidates, search.mean[:, None]], axis=1)
-            search = self._learn(search, candidates, score(candidates, score_key))
+        search = self.begin(state)
+        for iteration, part in enumerate(jax.random.split(key, self.num_iterations)):
+            search = self.iterate(score, search, part, iteration)
+        return self.end(search)
+
+    def iterate(
+        self, score: Score, search: "_Search", key: PRNGKeyArray, iteration: int = 0
+    ) -> "_Search":
+        """See `Optimizer.iterate`."""
+        draw_key, score_key = jax.random.split(key)
+        candidates = self._candidates(search, self.populations[iteration], draw_key)
+        if iteration == self.num_iterations - 1:
+            candidates = jnp.concatenate([candidates, search.mean[:, None]], axis=1)
+        return self._learn(search, candidates, score(candidates, score_key))
+
+    def end(self, search: "_Search") -> Plan:
+        """See `Optimizer.end`."""
         actions, mean = jnp.clip(search.best, -1.0, 1.0), jnp.clip(search.mean, -1.0, 1.0)
-        evaluations = jnp.full(len(actions), self.max_evaluations)
         ended = SearchState(mean, elites=search.elites)
-        return Plan(actions, search.best_return, search.failures, evaluations, ended)
+        return Plan(actions, search.best_return, search.failures, search.evaluations, ended)
+
+    def kind(self, iteration: int) -> int:
+        """See `Optimizer.kind`; each draws its own number of candidates."""
+        return iteration
 
     def shift(self, state: SearchState) -> SearchState:
         """See `Optimizer.shift`; the mean repeats its last action, the elites' is drawn."""
@@ -87,7 +99,8 @@ class ICEM(Optimizer):
         num_envs, *sequence_shape = state.guess.shape
         return jnp.full((num_envs, self.num_kept, *sequence_shape), jnp.inf, state.guess.dtype)
 
-    def _start(self, state: SearchState) -> "_Search":
+    def begin(self, state: SearchState) -> "_Search":
+        """See `Optimizer.begin`."""
         num_envs = len(state.guess)
         return _Search(
             mean=state.guess,
@@ -96,6 +109,7 @@ class ICEM(Optimizer):
             best=state.guess,
             best_return=jnp.full(num_envs, -jnp.inf),
             failures=jnp.zeros(num_envs, jnp.int32),
+            evaluations=jnp.zeros(num_envs, jnp.int32),
         )
 
     def _candidates(
@@ -117,6 +131,7 @@ class ICEM(Optimizer):
         returns: Float[Array, "env candidate"],
     ) -> "_Search":
         """Move the distribution towards the elites; nothing moves where no return is finite."""
+        search = search._replace(evaluations=search.evaluations + candidates.shape[1])
         returns = rank_non_finite_last(returns)
         elites, elite_returns = best_candidates(candidates, returns, self.num_elites)
         finite = jnp.isfinite(elite_returns)
@@ -129,6 +144,7 @@ class ICEM(Optimizer):
             best=elites[:, 0],
             best_return=elite_returns[:, 0],
             failures=search.failures,
+            evaluations=search.evaluations,
         )
         failed = search._replace(failures=search.failures + 1)
         return where_env(finite[:, 0], learned, failed)
@@ -143,3 +159,4 @@ class _Search(NamedTuple):
     best: Float[Array, "env horizon action"]
     best_return: Float[Array, " env"]
     failures: Int[Array, " env"]
+    evaluations: Int[Array, " env"]

@@ -1,8 +1,10 @@
 """Model predictive path integral control (MPPI)."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from headway.planning.optimizers.base import Optimizer, Plan, Score, SearchState
 from headway.planning.optimizers.noise import colored_noise
@@ -31,30 +33,47 @@ class MPPI(Optimizer):
         """See `Optimizer.max_evaluations`."""
         return self.num_candidates * self.num_iterations
 
-    def optimize(self, score: Score, state: SearchState, *, key: PRNGKeyArray) -> Plan:
-        """See `Optimizer.optimize`."""
-        num_envs, *sequence_shape = state.guess.shape
+    def begin(self, state: SearchState) -> "_Search":
+        """See `Optimizer.begin`."""
+        none = jnp.zeros(len(state.guess), jnp.int32)
+        return _Search(state.guess, jnp.zeros(len(state.guess)), none, none)
+
+    def iterate(
+        self, score: Score, search: "_Search", key: PRNGKeyArray, iteration: int = 0
+    ) -> "_Search":
+        """See `Optimizer.iterate`."""
+        del iteration  # all are alike
+        num_envs, *sequence_shape = search.mean.shape
+        draw_key, score_key = jax.random.split(key)
         shape = (num_envs, self.num_candidates, *sequence_shape)
+        noise = colored_noise(draw_key, shape, self.noise_beta)
+        candidates = jnp.clip(search.mean[:, None] + self.initial_std * noise, -1.0, 1.0)
+        returns = rank_non_finite_last(score(candidates, score_key))
+        weights = softmax_weights(returns, self.temperature)
+        found = jnp.isfinite(returns).any(-1)
+        average = (weights[..., None, None] * candidates).sum(1)
+        expected = (weights * jnp.where(weights > 0, returns, 0.0)).sum(-1)
+        return _Search(
+            mean=jnp.where(found[:, None, None], average, search.mean),
+            expected=jnp.where(found, expected, -jnp.inf),
+            failures=search.failures + ~found,
+            evaluations=search.evaluations + self.num_candidates,
+        )
 
-        def iterate(carry, key):
-            mean, failures, _ = carry
-            draw_key, score_key = jax.random.split(key)
-            noise = colored_noise(draw_key, shape, self.noise_beta)
-            candidates = jnp.clip(mean[:, None] + self.initial_std * noise, -1.0, 1.0)
-            returns = rank_non_finite_last(score(candidates, score_key))
-            weights = softmax_weights(returns, self.temperature)
-            found = jnp.isfinite(returns).any(-1)
-            average = (weights[..., None, None] * candidates).sum(1)
-            mean = jnp.where(found[:, None, None], average, mean)
-            expected = (weights * jnp.where(weights > 0, returns, 0.0)).sum(-1)
-            return (mean, failures + ~found, jnp.where(found, expected, -jnp.inf)), None
+    def end(self, search: "_Search") -> Plan:
+        """See `Optimizer.end`."""
+        actions = jnp.clip(search.mean, -1.0, 1.0)
+        ended = SearchState(actions)
+        return Plan(actions, search.expected, search.failures, search.evaluations, ended)
 
-        carry = state.guess, jnp.zeros(num_envs, jnp.int32), jnp.zeros(num_envs)
-        keys = jax.random.split(key, self.num_iterations)
-        (mean, failures, expected), _ = jax.lax.scan(iterate, carry, keys)
-        actions = jnp.clip(mean, -1.0, 1.0)
-        evaluations = jnp.full(num_envs, self.max_evaluations)
-        return Plan(actions, expected, failures, evaluations, SearchState(actions))
+
+class _Search(NamedTuple):
+    """A search under way."""
+
+    mean: Float[Array, "env horizon action"]
+    expected: Float[Array, " env"]
+    failures: Int[Array, " env"]
+    evaluations: Int[Array, " env"]
 
 
 def softmax_weights(

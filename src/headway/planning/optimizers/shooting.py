@@ -1,8 +1,10 @@
 """Random shooting: no learning from one round to the next."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from headway.planning.optimizers.base import Optimizer, Plan, Score, SearchState
 from headway.planning.optimizers.ranking import rank_non_finite_last
@@ -22,27 +24,43 @@ class RandomShooting(Optimizer):
         """See `Optimizer.max_evaluations`."""
         return self.num_candidates * self.num_iterations
 
-    def optimize(self, score: Score, state: SearchState, *, key: PRNGKeyArray) -> Plan:
-        """See `Optimizer.optimize`."""
-        num_envs, *sequence_shape = state.guess.shape
+    def begin(self, state: SearchState) -> "_Search":
+        """See `Optimizer.begin`."""
+        none = jnp.zeros(len(state.guess), jnp.int32)
+        return _Search(state.guess, jnp.full(len(state.guess), -jnp.inf), none, none)
 
-        def iterate(carry, key):
-            best, best_return, failures = carry
-            draw_key, score_key = jax.random.split(key)
-            shape = (num_envs, self.num_candidates, *sequence_shape)
-            candidates = jax.random.uniform(draw_key, shape, minval=-1.0, maxval=1.0)
-            returns = rank_non_finite_last(score(candidates, score_key))
-            winner = jnp.argmax(returns, axis=-1)
-            top = jnp.take_along_axis(returns, winner[:, None], axis=1)[:, 0]
-            sequence = jnp.take_along_axis(candidates, winner[:, None, None, None], axis=1)[:, 0]
-            better = top > best_return
-            best = jnp.where(better[:, None, None], sequence, best)
-            failures = failures + ~jnp.isfinite(top)
-            return (best, jnp.maximum(best_return, top), failures), None
+    def iterate(
+        self, score: Score, search: "_Search", key: PRNGKeyArray, iteration: int = 0
+    ) -> "_Search":
+        """See `Optimizer.iterate`."""
+        del iteration  # all are alike
+        num_envs, *sequence_shape = search.best.shape
+        draw_key, score_key = jax.random.split(key)
+        shape = (num_envs, self.num_candidates, *sequence_shape)
+        candidates = jax.random.uniform(draw_key, shape, minval=-1.0, maxval=1.0)
+        returns = rank_non_finite_last(score(candidates, score_key))
+        winner = jnp.argmax(returns, axis=-1)
+        top = jnp.take_along_axis(returns, winner[:, None], axis=1)[:, 0]
+        sequence = jnp.take_along_axis(candidates, winner[:, None, None, None], axis=1)[:, 0]
+        better = top > search.best_return
+        return _Search(
+            best=jnp.where(better[:, None, None], sequence, search.best),
+            best_return=jnp.maximum(search.best_return, top),
+            failures=search.failures + ~jnp.isfinite(top),
+            evaluations=search.evaluations + self.num_candidates,
+        )
 
-        carry = state.guess, jnp.full(num_envs, -jnp.inf), jnp.zeros(num_envs, jnp.int32)
-        keys = jax.random.split(key, self.num_iterations)
-        (best, best_return, failures), _ = jax.lax.scan(iterate, carry, keys)
-        actions = jnp.clip(best, -1.0, 1.0)
-        evaluations = jnp.full(num_envs, self.max_evaluations)
-        return Plan(actions, best_return, failures, evaluations, SearchState(actions))
+    def end(self, search: "_Search") -> Plan:
+        """See `Optimizer.end`."""
+        actions = jnp.clip(search.best, -1.0, 1.0)
+        ended = SearchState(actions)
+        return Plan(actions, search.best_return, search.failures, search.evaluations, ended)
+
+
+class _Search(NamedTuple):
+    """A search under way."""
+
+    best: Float[Array, "env horizon action"]
+    best_return: Float[Array, " env"]
+    failures: Int[Array, " env"]
+    evaluations: Int[Array, " env"]
