@@ -31,7 +31,7 @@ def test_cadm_has_its_own_choices():
         assert (model.context, model.context_at, model.context_size) == ("learned", "input", 10)
         assert (model.history_length, fitting.future_length) == (10, 10)
         assert model.backward_net
-        assert model.backward_deterministic
+        assert model.deterministic or model.backward_deterministic
         assert (fitting.oracle, fitting.backward_weight, fitting.batch_size) == (
             "independent",
             0.5,
