@@ -57,7 +57,6 @@ _VANILLA: Settings = {
 }
 _CADM: Settings = {
     "model.context_at": "input",
-    "model.backward_deterministic": True,
     "fitting.future_length": 10,
     "fitting.context_weight_decay": True,
 }
@@ -122,7 +121,7 @@ _METHODS = (
     Method(
         "pets-cadm",
         "PETS with CaDM's learned context at the input (Lee et al., 2020)",
-        {**_ONE_HEAD, **_CADM},
+        {**_ONE_HEAD, **_CADM, "model.backward_deterministic": True},
     ),
     Method(
         "oracle-params",

@@ -237,7 +237,8 @@ def update(
         # Both gradients are taken at the same weights, each with an Adam of its own.
         decay = setup.config.weight_decay
         relation, grads = relation_gradient(state.model, data.statistics, batch, similar, decay)
-        changes, moments = setup.optimizer.update(grads, state.relation_optimizer)
+        moments: Any = state.relation_optimizer
+        changes, moments = setup.optimizer.update(grads, moments)
         stepped = FitState(add_parts(stepped.model, changes), stepped.optimizer, moments)
         finite &= jnp.isfinite(relation) & jnp.isfinite(optax.tree.norm(grads))
     kept = jax.tree.map(functools.partial(jnp.where, finite), stepped, state)

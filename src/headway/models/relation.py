@@ -6,7 +6,7 @@ the predictions as they are. A linear relation head learns to tell whether two c
 same, and what it learns shapes the context encoder.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -182,8 +182,8 @@ def relation_gradient(
     batch: Batch,
     similar: Float[Array, "member sample sample"],
     decay: float,
-) -> tuple[Float[Array, ""], RelationParts]:
-    """The relation loss with weight decay, and its gradient.
+) -> tuple[Float[Array, ""], Any]:
+    """The relation loss with weight decay, and its gradient, laid out as `RelationParts`.
 
     Args:
         model: A model with a relation head.
@@ -208,8 +208,8 @@ def relation_parts(model: MultiHeadDynamics) -> RelationParts:
     return RelationParts(model.context_encoder, model.relation_head)
 
 
-def add_parts(model: MultiHeadDynamics, changes: RelationParts) -> MultiHeadDynamics:
-    """Add changes to what the relation loss teaches."""
+def add_parts(model: MultiHeadDynamics, changes: Any) -> MultiHeadDynamics:
+    """Add changes, laid out as `RelationParts`, to what the relation loss teaches."""
     parts = eqx.apply_updates(relation_parts(model), changes)
     where = lambda model: (model.context_encoder, model.relation_head)  # noqa: E731
     return eqx.tree_at(where, model, (parts.encoder, parts.head))

@@ -135,7 +135,7 @@ class Prepared(NamedTuple):
     """All that is known in a step before its search."""
 
     recent: RecentTransitions
-    learned: LastLayer | None
+    learned: Learned
     heads: Int[Array, "env member"]
     dynamics: ImaginedDynamics
     key: PRNGKeyArray

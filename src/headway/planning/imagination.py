@@ -85,7 +85,7 @@ class ImaginedDynamics(eqx.Module):
     """With a leading environment axis after `fold`, without one after `with_heads`."""
     delta_std: Float[Array, " obs"]
     context_layer: int | None = eqx.field(static=True, default=None)
-    """The hidden layer that the context joins; None if it joins the heads, or there is none."""
+    """The hidden layer that the context joins; None if it joins the heads."""
 
     @classmethod
     def fold(
@@ -118,10 +118,9 @@ class ImaginedDynamics(eqx.Module):
             _layer(_fold_input(first, statistics), jnp.float32),
             *(_layer(layer, dtype) for layer in others),
         )
-        context_bias, place = None, None
-        if shift is not None:
-            place, context = net.context_layer, None
-            context_bias = hidden[place].bias + shift
+        context_bias, place = None, net.context_layer
+        if place is not None and shift is not None:
+            context, context_bias = None, hidden[place].bias + shift
         delta = statistics.delta
         mean_weight, mean_bias = _chosen(net.mean_heads, heads, context, correction)
         weights = [mean_weight.mean(2) * delta.std]
