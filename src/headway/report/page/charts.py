@@ -3,9 +3,12 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.collections import PatchCollection
+from matplotlib.colors import to_hex, to_rgba
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
@@ -16,7 +19,7 @@ from headway.report.page.runs import Row
 from headway.report.page.series import Series
 from headway.report.page.svg import DASHES, MARKERS, SWATCHES
 from headway.report.physics import axis_label, distinct, value_label, varying
-from headway.report.style import FAINT, INK, group_label, label_axis
+from headway.report.style import FAINT, INK, RULE, group_label, label_axis
 
 Marks = Mapping[str, float]
 
@@ -137,15 +140,15 @@ def head_shares(axes: Axes, rows: Sequence[Row]) -> None:
     column = {text: physics.index(sim_params) for text, sim_params in by_text.items()}
     owners = sorted({(int(row["member"]), int(row["head"])) for row in rows})
     heads = 1 + max(head for _, head in owners)
-    for row in rows:
-        y = row["member"] * (heads + 0.5) + row["head"]
-        cell = {"edgecolor": "none", "facecolor": SWATCHES[0][0], "alpha": float(row["share"])}
-        axes.add_patch(Rectangle((column[row["sim_params"]] - 0.47, y - 0.47), 0.94, 0.94, **cell))
-    places = [member * (heads + 0.5) + head for member, head in owners]
-    for y in places:
+    shares = {(int(r["member"]), int(r["head"]), column[r["sim_params"]]): r["share"] for r in rows}
+    cells, colors, places = [], [], []
+    for member, head in owners:
+        places.append(member * (heads + 0.5) + head)
         for x in range(len(physics)):
-            frame = {"fill": False, "edgecolor": "#e4e4e4", "linewidth": 0.5}
-            axes.add_patch(Rectangle((x - 0.47, y - 0.47), 0.94, 0.94, **frame))
+            cells.append(Rectangle((x - 0.47, places[-1] - 0.47), 0.94, 0.94))
+            colors.append(to_rgba(SWATCHES[0][0], float(shares.get((member, head, x), 0.0))))
+    frames = {"edgecolor": RULE, "linewidth": 0.5}
+    axes.add_collection(PatchCollection(cells, facecolor=colors, **frames))
     names = varying(physics)
     axes.set_xticks(range(len(physics)), [value_label(p, names) for p in physics])
     axes.set_yticks(places, [f"{member} · {head}" for member, head in owners], fontsize=6.5)
@@ -194,9 +197,6 @@ def contexts(
 
 def physics_color(index: int, count: int) -> str:
     """A colour of an ordered scale that can be seen on light and on dark ground."""
-    import matplotlib
-    from matplotlib.colors import to_hex
-
     place = 0.16 + 0.66 * (index / max(count - 1, 1))
     return to_hex(matplotlib.colormaps["plasma"](place))
 

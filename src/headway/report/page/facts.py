@@ -99,7 +99,7 @@ def sources(comparison: Comparison) -> Section:
                 done = f"{len(run.metrics)} of {run.config.collection.num_iterations}"
                 command = shlex.join(train_command(run))
                 cells = [
-                    Cell(str(run.path), command, is_code=True),
+                    Cell(str(run.path), [command], is_code=True),
                     Cell(series.label, is_key=True),
                     Cell(str(run.config.seed), is_number=True),
                     Cell(done, is_number=True),

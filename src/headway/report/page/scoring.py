@@ -18,6 +18,16 @@ _Place = tuple[str, str, int]  # environment, physics, steps of the episode
 
 
 @dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How one run did on one group after its last iteration."""
+
+    episode_return: float
+    """Mean over the group's physics, each counting once."""
+    score: float | None
+    """The same of scores; None unless references are known for all of them."""
+
+
+@dataclasses.dataclass(frozen=True)
 class References:
     """Mean returns of `random` and `true-dynamics` for each physics."""
 
@@ -56,6 +66,25 @@ class References:
         if methods == set(REFERENCES):
             return "normalised by the runs of random and true-dynamics given here"
         return "normalised by the project's reference returns"
+
+
+def outcome(rows: Sequence[EpisodeRow], references: References) -> Outcome:
+    """Summarise one run's test episodes of one group."""
+    returns, scores = [], []
+    for same in by_physics(rows).values():
+        returns.append(np.mean([row.episode_return for row in same]))
+        known = [references.score(row) for row in same]
+        scores.append(None if None in known else float(np.mean(known)))
+    whole = None if None in scores else float(np.mean(scores))
+    return Outcome(float(np.mean(returns)), whole)
+
+
+def by_physics(rows: Sequence[EpisodeRow]) -> dict[str, list[EpisodeRow]]:
+    """Episodes by their simulator parameters."""
+    found: dict[str, list[EpisodeRow]] = {}
+    for row in rows:
+        found.setdefault(format_sim_params(row.sim_params), []).append(row)
+    return found
 
 
 def _by_place(rows: Iterable[EpisodeRow]) -> dict[_Place, float]:

@@ -92,6 +92,8 @@ def _inline(document: str, name: str, label: str) -> str:
     svg = re.sub(r'(<\w+) id="', rf'\1 id="{name}-', svg)
     svg = re.sub(r' xlink:href="#', f' href="#{name}-', svg)
     svg = svg.replace('"url(#', f'"url(#{name}-')
+    wanted = set(re.findall(r'(?:href="#|url\(#)([^")]+)', svg))
+    svg = re.sub(r' id="([^"]+)"', lambda match: match[0] if match[1] in wanted else "", svg)
     svg = re.sub(r"<style.*?</style>", "", svg, flags=re.DOTALL)  # the page has it
     svg = re.sub(r" font-family: [^;\"]*;", "", svg)
     svg = re.sub(r"(\d\.\d\d)\d+", r"\1", svg)
