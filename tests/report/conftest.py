@@ -113,7 +113,7 @@ def write(
     return path
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def write_run():
     return write
 

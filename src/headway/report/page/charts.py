@@ -222,7 +222,7 @@ def run_times(axes: Axes, bars: Sequence[tuple[Series, Mapping[str, float]]]) ->
     axes.grid(visible=False, axis="y")
     axes.grid(visible=True, axis="x")
     axes.xaxis.set_major_locator(MaxNLocator(5))
-    axes.set_xlabel("minutes: collect, fit (paler), evaluate (palest)")
+    axes.set_xlabel("minutes")
 
 
 def group_title(group: str) -> str:

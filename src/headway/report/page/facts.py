@@ -72,8 +72,8 @@ def times(comparison: Comparison) -> Section:
         columns = ["method", *(f"{phase}, min" for phase in PHASES), "all, min", "device"]
         blocks.append(Block(env, [Panel("", drawn)], Table(columns, lines)))
     lead = (
-        "Minutes per finished run, mean over seeds. They are comparable only where the runs had the"
-        " machine to themselves."
+        "Minutes per finished run, mean over seeds; from full to pale: collecting, fitting,"
+        " testing. They are comparable only where the runs had the machine to themselves."
     )
     return Section("times", "Run times", lead, blocks)
 

@@ -12,7 +12,8 @@ def symbol(series: Series) -> str:
     """A small SVG of a piece of line with one marker; the page holds it once."""
 
     def draw(axes: Axes) -> None:
-        axes.plot([0, 1, 2], [0, 0, 0], **charts.look(series), markersize=5, markevery=[1])
+        look = {**charts.look(series), "gid": None}  # it stays when the series is hidden
+        axes.plot([0, 1, 2], [0, 0, 0], **look, markersize=5, markevery=[1])
         axes.set_axis_off()
         axes.margins(0.02, 0.5)
 
