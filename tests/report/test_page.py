@@ -15,10 +15,12 @@ import headway
 from headway.cli import main
 from headway.errors import ConfigError, RunError, UnknownNameError
 from headway.experiment.runs import RunDir
+from headway.report.page import contexts
 from headway.report.page.build import SECTIONS, write_report
 from headway.report.page.contexts import principal_components, variance_between
 from headway.report.page.runs import load_runs, train_command
 from headway.report.page.series import Comparison, series_labels
+from headway.report.page.svg import THEME
 
 SAMPLE = Path(__file__).parent.parent / "data" / "run-schema-2"  # two of three iterations
 HOSTILE = '<script>alert("1")</script>&amp;$x_{2}$'
@@ -204,6 +206,23 @@ def test_contexts_are_drawn_from_the_checkpoint(tmp_path):
     shutil.rmtree(path / "data")
     page = write_report([path], tmp_path / "b.html", only=["contexts"]).read_text()
     assert f"{path} has no contexts to show: " in text_of(page)
+
+
+def test_colours_follow_the_theme(tmp_path):
+    lights = [light for light, _ in THEME.values()]
+    assert len(set(lights)) == len(lights)
+    page = write_report([SAMPLE], tmp_path / "report.html", only=["contexts"]).read_text()
+    figure = re.search(r"<figure>.*?</figure>", page, re.DOTALL)[0]
+    assert "#" not in re.sub(r'(?:href="|url\()#', "", figure)  # no colour but the theme's
+    used = set(re.findall(r"fill: var\(--(p\d+)\)", figure))
+    physics = {tuple(t.sim_params.items()) for t in RunDir(SAMPLE).load_data()}
+    assert len(used) == len(physics) > 1
+
+
+def test_a_method_without_a_model_has_no_contexts(tmp_path, monkeypatch):
+    monkeypatch.setattr(contexts, "load_agent", lambda run, config: object())
+    page = write_report([SAMPLE], tmp_path / "report.html", only=["contexts"]).read_text()
+    assert "No learned context: tmcl, seed 0." in page
 
 
 def test_principal_components():

@@ -3,12 +3,11 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
-from matplotlib.colors import to_hex, to_rgba
+from matplotlib.colors import to_rgba
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
@@ -17,7 +16,7 @@ from headway.report import statistics
 from headway.report.page.measures import Curve
 from headway.report.page.runs import Row
 from headway.report.page.series import Series
-from headway.report.page.svg import DASHES, MARKERS, SWATCHES
+from headway.report.page.svg import DASHES, MARKERS, ORDERED, SWATCHES
 from headway.report.physics import axis_label, distinct, value_label, varying
 from headway.report.style import FAINT, INK, RULE, group_label, label_axis
 
@@ -190,15 +189,15 @@ def contexts(
     label_axis(axes, f"1st component ({share[0]})", f"2nd component ({share[1]})")
     legend = axes.legend(
         title=axis_label(names), loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.3,
-        fontsize=7.5, title_fontsize=7.5, handletextpad=0.1, labelspacing=0.3,
+        fontsize=7.5, title_fontsize=7.5, handletextpad=0.1,
+        markerscale=1.6, labelspacing=0.3,
     )  # fmt: skip
     legend.get_title().set_color(INK)
 
 
 def physics_color(index: int, count: int) -> str:
-    """A colour of an ordered scale that can be seen on light and on dark ground."""
-    place = 0.16 + 0.66 * (index / max(count - 1, 1))
-    return to_hex(matplotlib.colormaps["plasma"](place))
+    """A colour for the value of this rank among all."""
+    return ORDERED[round(index * (len(ORDERED) - 1) / max(count - 1, 1))][0]
 
 
 def run_times(axes: Axes, bars: Sequence[tuple[Series, Mapping[str, float]]]) -> None:

@@ -10,9 +10,11 @@ import re
 from collections.abc import Callable
 
 import matplotlib
+import numpy as np
 from markupsafe import escape
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from headway.report import style
@@ -31,6 +33,13 @@ SWATCHES = (
 )
 """Colours of series in light and dark: Okabe and Ito's hues, dark enough for lines on white."""
 
+_SCALE = matplotlib.colormaps["plasma"]
+ORDERED = tuple(
+    (to_hex(_SCALE(0.08 + 0.72 * place)), to_hex(_SCALE(0.4 + 0.6 * place)))
+    for place in np.linspace(0, 1, 12)
+)
+"""Colours of ascending values in light and dark, all of them far from the ground."""
+
 MARKERS = "osD^vPX*"
 DASHES: tuple[str | tuple[int, tuple[int, ...]], ...] = ("-", (0, (5, 2)), (0, (1, 1.5)))  # type: ignore
 
@@ -41,6 +50,7 @@ THEME = {
     "axis": ("#9a9a9a", "#60616b"),
     "paper": ("#ffffff", "#17181c"),
     **{f"s{i}": pair for i, pair in enumerate(SWATCHES)},
+    **{f"p{i}": pair for i, pair in enumerate(ORDERED)},
 }
 """Variables of the style sheet: their value in light and in dark."""
 
