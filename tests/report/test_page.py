@@ -41,6 +41,14 @@ def folder(tmp_path, write_run):
     return root
 
 
+@pytest.fixture
+def pair(tmp_path, write_run):
+    """Two runs of one method."""
+    for seed in (0, 1):
+        write_run(tmp_path / f"pair/tmcl-{seed}", seed=seed)
+    return tmp_path / "pair"
+
+
 def text_of(page):
     return html.unescape(re.sub(r"<[^>]+>", " ", page))
 
@@ -159,11 +167,11 @@ def test_a_run_is_not_counted_twice(folder, tmp_path):
         ("prediction_error.csv", "no prediction errors"),
     ],
 )
-def test_damage_costs_one_line(folder, tmp_path, name, lost):
-    (folder / "tmcl-1" / name).write_bytes(b"\xff\x00 not what it was\n")
-    page = write_report([folder], tmp_path / "report.html").read_text()
+def test_damage_costs_one_line(pair, tmp_path, name, lost):
+    (pair / "tmcl-1" / name).write_bytes(b"\xff\x00 not what it was\n")
+    page = write_report([pair], tmp_path / "report.html").read_text()
     notes = re.findall(r"<li><code>(.*?)</code> (.*?)</li>", page)
-    assert [run for run, _ in notes[:1]] == [str(folder / "tmcl-1")]
+    assert [run for run, _ in notes[:1]] == [str(pair / "tmcl-1")]
     assert notes[0][1].startswith(lost)
     assert re.findall(r'<section id="([\w-]+)">', page) == list(SECTIONS)
 

@@ -178,7 +178,11 @@ def contexts(
     for index, sim_params in enumerate(different):
         chosen = points[[dict(p) == sim_params for p in physics]]
         color = physics_color(index, len(different))
-        look = {"color": color, "marker": MARKERS[index % len(MARKERS)], "linestyle": "none"}
+        look: dict[str, Any] = {
+            "color": color,
+            "marker": MARKERS[index % len(MARKERS)],
+            "linestyle": "none",
+        }
         label = value_label(sim_params, names)
         axes.plot(*chosen.T, **look, markersize=3, alpha=0.7, markeredgewidth=0, label=label)
     axes.grid(visible=False)

@@ -53,7 +53,7 @@ def times(comparison: Comparison) -> Section:
             if not runs:
                 continue
             taken = [run_minutes(run) for run in runs]
-            minutes = {phase: np.mean([one[phase] for one in taken]) for phase in PHASES}
+            minutes = {phase: float(np.mean([one[phase] for one in taken])) for phase in PHASES}
             bars.append((series, minutes))
             cells = [_minutes(minutes[phase]) for phase in PHASES]
             cells.append(_minutes(sum(minutes.values())))

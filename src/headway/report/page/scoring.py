@@ -56,9 +56,7 @@ class References:
 
     def level(self, method: str, rows: Iterable[EpisodeRow]) -> float | None:
         """Mean return of a reference over the places of some episodes; None if one lacks."""
-        values = [self.returns.get((method, place)) for place in {_place(row) for row in rows}]
-        known = [value for value in values if value is not None]
-        return float(np.mean(known)) if known and len(known) == len(values) else None
+        return _mean([self.returns.get((method, place)) for place in {_place(row) for row in rows}])
 
     def describe(self, env: str) -> str:
         """Say where the references of an environment come from."""
@@ -70,13 +68,16 @@ class References:
 
 def outcome(rows: Sequence[EpisodeRow], references: References) -> Outcome:
     """Summarise one run's test episodes of one group."""
-    returns, scores = [], []
-    for same in by_physics(rows).values():
-        returns.append(np.mean([row.episode_return for row in same]))
-        known = [references.score(row) for row in same]
-        scores.append(None if None in known else float(np.mean(known)))
-    whole = None if None in scores else float(np.mean(scores))
-    return Outcome(float(np.mean(returns)), whole)
+    parts = by_physics(rows).values()
+    returns = [np.mean([row.episode_return for row in same]) for same in parts]
+    scores = [_mean([references.score(row) for row in same]) for same in parts]
+    return Outcome(float(np.mean(returns)), _mean(scores))
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """The mean, or None where one value is missing."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known and len(known) == len(values) else None
 
 
 def by_physics(rows: Sequence[EpisodeRow]) -> dict[str, list[EpisodeRow]]:

@@ -221,7 +221,7 @@ def improvements(comparison: Comparison) -> Section:
     return Section("improvement", "Probability of improvement", lead, [block])
 
 
-def _caution(found: Mapping[object, Estimate]) -> str:
+def _caution(found: Mapping[tuple[str, str], Estimate]) -> str:
     return statistics.caution(min((one.num_runs for one in found.values()), default=0))
 
 

@@ -8,6 +8,7 @@ page lays panels out in as many columns as it has room for.
 import io
 import re
 from collections.abc import Callable
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -55,7 +56,7 @@ THEME = {
 """Variables of the style sheet: their value in light and in dark."""
 
 _VARIABLES = {light.lower(): f"var(--{name})" for name, (light, _) in THEME.items()}
-_SETTINGS = {
+_SETTINGS: dict[Any, Any] = {
     "svg.fonttype": "none",
     "text.parse_math": False,  # a dollar is a dollar
     "figure.facecolor": "none",
