@@ -61,26 +61,41 @@ def assignment_rows(rng, iterations, members, heads):
                     }
 
 
-def write(path, *, iterations=5, evaluated=(4,), env="pendulum", members=5, heads=3):
-    """Write every file that the figures read."""
-    rng = np.random.default_rng(0)
+def write(
+    path,
+    *,
+    iterations=5,
+    evaluated=(4,),
+    env="pendulum",
+    members=5,
+    heads=3,
+    method="tmcl",
+    seed=0,
+    lift=0.0,
+    settings_changed=None,
+):
+    """Write every file that the figures read; `lift` is added to the returns of the tests."""
+    rng = np.random.default_rng(seed)
     run = RunDir(path)
     config = Config(
         env=env,
+        method=method,
+        seed=seed,
         preset="quick",
         collection=CollectionConfig(num_iterations=iterations, num_episodes=5),
     )
+    config = settings.override(config, settings_changed or {})
     path.mkdir(parents=True, exist_ok=True)
     content = {"schema": 1, "config": settings.to_dict(config)}
     (path / "config.json").write_text(json.dumps(content))
     run.append_metrics(metrics_rows(rng, iterations, evaluated))
     rows = [
         EpisodeRow(
-            "tmcl", env, 0, i, group, physics(lengths[k % len(lengths)]), k, float(value), 200
+            method, env, seed, i, group, physics(lengths[k % len(lengths)]), k, float(value), 200
         )
         for i in evaluated
         for group, lengths in GROUPS.items()
-        for k, value in enumerate(rng.normal(LEVELS[group], 150, 8))
+        for k, value in enumerate(rng.normal(LEVELS[group] + lift, 150, 8))
     ]
     run.append_evaluation(rows)
     run.append_assignments(assignment_rows(rng, iterations, members, heads))
@@ -98,7 +113,7 @@ def write(path, *, iterations=5, evaluated=(4,), env="pendulum", members=5, head
     return path
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def write_run():
     return write
 

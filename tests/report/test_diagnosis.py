@@ -65,6 +65,12 @@ def test_what_diagnose_refuses(run_dir, words, said, capsys):
     assert said in capsys.readouterr().err
 
 
+def test_only_models_with_heads_are_diagnosed(run_dir, monkeypatch):
+    monkeypatch.setattr(diagnosis, "load_agent", lambda run: object())
+    with pytest.raises(ConfigError, match="a run of tmcl, which has no prediction heads"):
+        headway.diagnose(run_dir)
+
+
 def test_only_runs_are_diagnosed(tmp_path, capsys):
     assert main(["diagnose", str(tmp_path)]) == 1
     assert "config.json is missing" in capsys.readouterr().err

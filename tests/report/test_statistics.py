@@ -11,6 +11,7 @@ from scipy import stats
 from headway.errors import ConfigError
 from headway.report.statistics import (
     Estimate,
+    caution,
     estimate,
     interquartile_mean,
     interval,
@@ -153,9 +154,17 @@ def test_nothing_is_claimed_from_fewer_than_three_seeds(runs):
 def test_verdicts(improvement, said):
     text = verdict("tmcl", "pets", improvement)
     assert text.startswith(said)
-    assert "too narrow" in text
-    enough = Estimate(improvement.value, improvement.interval, 10)
-    assert "too narrow" not in verdict("tmcl", "pets", enough)
+    assert "; 3 seeds)" in text
+
+
+def test_few_seeds_ask_for_caution():
+    assert "fewer than 10 seeds are too narrow" in caution(9)
+    assert caution(10) == ""
+
+
+def test_an_improvement_has_its_other_side():
+    assert Estimate(0.75, (0.5, 1.0), 3).complement == Estimate(0.25, (0.0, 0.5), 3)
+    assert Estimate(0.75, None, 2).complement == Estimate(0.25, None, 2)
 
 
 def test_normalised():

@@ -22,6 +22,7 @@ from headway.experiment.selection import (
 )
 from headway.experiment.testing import run_tests
 from headway.experiment.training import load_agent
+from headway.models.dynamics import MultiHeadDynamics
 from headway.planning.agent import Agent
 from headway.report.physics import distinct, full_label, varying
 from headway.report.tables import new_table
@@ -87,13 +88,23 @@ def diagnose(
     Raises:
         RunError: There is no trained run, or it is damaged.
         UnknownNameError: No such group.
-        ConfigError: `collected` leaves no choice of groups and episodes.
+        ConfigError: `collected` leaves no choice of groups and episodes, or the run's method has
+            no model with heads.
         LimitError: Planning needs more memory than is free.
     """
+    _check_heads(RunDir(run_dir))
     if collected:
         return _of_collected(run_dir, groups, num_episodes)
     tested = run_tests(run_dir, groups=groups, num_episodes=num_episodes, progress=progress)
     return _examined(Path(run_dir), tested.config, tested.agent, tested.trajectories)
+
+
+def _check_heads(run: RunDir) -> None:
+    if not isinstance(getattr(load_agent(run), "model", None), MultiHeadDynamics):
+        raise ConfigError(
+            f"{run.path} is a run of {run.config().method}, which has no prediction heads, allowed:"
+            " methods with a multi-headed model, such as tmcl."
+        )
 
 
 def _of_collected(

@@ -34,6 +34,12 @@ class Estimate:
     num_runs: int
     """Runs of the task that has the fewest."""
 
+    @property
+    def complement(self) -> "Estimate":
+        """One minus this: of a probability of improvement, that the other method improves."""
+        ends = self.interval and (1 - self.interval[1], 1 - self.interval[0])
+        return Estimate(1 - self.value, ends, self.num_runs)
+
 
 def mean(scores: Scores) -> np.ndarray:
     """Mean over tasks of the mean over runs.
@@ -189,6 +195,8 @@ def normalised(episode_return: float, random: float, ceiling: float) -> float:
 def verdict(first: str, second: str, improvement: Estimate) -> str:
     """Word what a comparison shows; nothing is claimed from fewer than `MIN_RUNS` seeds.
 
+    Say `caution` beside it.
+
     Args:
         first: Name of the first method.
         second: Name of the second method.
@@ -207,14 +215,17 @@ def verdict(first: str, second: str, improvement: Estimate) -> str:
     else:
         claim = f"no difference between {first} and {second} is shown"
     numbers = f"probability of improvement {improvement.value:.2f}, {low:.2f} to {high:.2f}"
-    return f"{claim} ({numbers}; {_seeds(improvement.num_runs)}).{caution(improvement.num_runs)}"
+    return f"{claim} ({numbers}; {_seeds(improvement.num_runs)})."
 
 
 def caution(num_runs: int) -> str:
     """Warn of intervals that are too narrow; nothing where there are runs enough."""
     if num_runs >= ENOUGH_RUNS:
         return ""
-    return f" Intervals from fewer than {ENOUGH_RUNS} seeds are too narrow: a hint, no proof."
+    return (
+        f"Intervals from fewer than {ENOUGH_RUNS} seeds are too narrow: take what they show as a"
+        " hint."
+    )
 
 
 def _seeds(num_runs: int) -> str:

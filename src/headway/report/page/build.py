@@ -19,7 +19,7 @@ from headway.report.page.parts import Section
 from headway.report.page.runs import load_runs
 from headway.report.page.series import Comparison
 from headway.report.page.svg import THEME
-from headway.report.page.symbols import symbol
+from headway.report.page.symbols import same_symbol, symbol
 
 SECTIONS: dict[str, Callable[[Comparison], Section]] = {
     "results": sections.results,
@@ -34,6 +34,8 @@ SECTIONS: dict[str, Callable[[Comparison], Section]] = {
     "runs": facts.sources,
     "numbers": facts.numbers,
 }
+
+NAMED = 4  # methods in the title
 
 
 def write_report(
@@ -88,9 +90,11 @@ def render(comparison: Comparison, made: Sequence[Section], command: str) -> str
     script = _resource("page.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     return environment.get_template("page.html.jinja").render(
+        title=_title([series.label for series in comparison.series]),
         sections=made,
         comparison=comparison,
-        symbols={series.index: Markup(symbol(series)) for series in comparison.series},
+        symbols={one.index: Markup(symbol(one)) for one in comparison.series},
+        same_symbols={one.index: Markup(same_symbol(one)) for one in comparison.series},
         command=command,
         version=headway.__version__,
         style=Markup(_theme() + _resource("page.css") + _switches(comparison)),
@@ -98,6 +102,12 @@ def render(comparison: Comparison, made: Sequence[Section], command: str) -> str
         script_digest=digest,
         svg=Markup,
     )
+
+
+def _title(labels: Sequence[str]) -> str:
+    if len(labels) > NAMED:
+        return f"{len(labels)} methods compared"
+    return " and ".join(filter(None, [", ".join(labels[:-1]), labels[-1]]))
 
 
 def _theme() -> str:

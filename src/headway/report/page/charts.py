@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.collections import PatchCollection
+from matplotlib.colors import to_rgba
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
@@ -14,9 +16,9 @@ from headway.report import statistics
 from headway.report.page.measures import Curve
 from headway.report.page.runs import Row
 from headway.report.page.series import Series
-from headway.report.page.svg import DASHES, MARKERS, SWATCHES
+from headway.report.page.svg import DASHES, MARKERS, ORDERED, SWATCHES
 from headway.report.physics import axis_label, distinct, value_label, varying
-from headway.report.style import FAINT, INK, group_label, label_axis
+from headway.report.style import FAINT, INK, RULE, group_label, label_axis
 
 Marks = Mapping[str, float]
 
@@ -137,15 +139,15 @@ def head_shares(axes: Axes, rows: Sequence[Row]) -> None:
     column = {text: physics.index(sim_params) for text, sim_params in by_text.items()}
     owners = sorted({(int(row["member"]), int(row["head"])) for row in rows})
     heads = 1 + max(head for _, head in owners)
-    for row in rows:
-        y = row["member"] * (heads + 0.5) + row["head"]
-        cell = {"edgecolor": "none", "facecolor": SWATCHES[0][0], "alpha": float(row["share"])}
-        axes.add_patch(Rectangle((column[row["sim_params"]] - 0.47, y - 0.47), 0.94, 0.94, **cell))
-    places = [member * (heads + 0.5) + head for member, head in owners]
-    for y in places:
+    shares = {(int(r["member"]), int(r["head"]), column[r["sim_params"]]): r["share"] for r in rows}
+    cells, colors, places = [], [], []
+    for member, head in owners:
+        places.append(member * (heads + 0.5) + head)
         for x in range(len(physics)):
-            frame = {"fill": False, "edgecolor": "#e4e4e4", "linewidth": 0.5}
-            axes.add_patch(Rectangle((x - 0.47, y - 0.47), 0.94, 0.94, **frame))
+            cells.append(Rectangle((x - 0.47, places[-1] - 0.47), 0.94, 0.94))
+            colors.append(to_rgba(SWATCHES[0][0], float(shares.get((member, head, x), 0.0))))
+    frames = {"edgecolor": RULE, "linewidth": 0.5}
+    axes.add_collection(PatchCollection(cells, facecolor=colors, **frames))
     names = varying(physics)
     axes.set_xticks(range(len(physics)), [value_label(p, names) for p in physics])
     axes.set_yticks(places, [f"{member} · {head}" for member, head in owners], fontsize=6.5)
@@ -176,7 +178,11 @@ def contexts(
     for index, sim_params in enumerate(different):
         chosen = points[[dict(p) == sim_params for p in physics]]
         color = physics_color(index, len(different))
-        look = {"color": color, "marker": MARKERS[index % len(MARKERS)], "linestyle": "none"}
+        look: dict[str, Any] = {
+            "color": color,
+            "marker": MARKERS[index % len(MARKERS)],
+            "linestyle": "none",
+        }
         label = value_label(sim_params, names)
         axes.plot(*chosen.T, **look, markersize=3, alpha=0.7, markeredgewidth=0, label=label)
     axes.grid(visible=False)
@@ -187,18 +193,15 @@ def contexts(
     label_axis(axes, f"1st component ({share[0]})", f"2nd component ({share[1]})")
     legend = axes.legend(
         title=axis_label(names), loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.3,
-        fontsize=7.5, title_fontsize=7.5, handletextpad=0.1, labelspacing=0.3,
+        fontsize=7.5, title_fontsize=7.5, handletextpad=0.1,
+        markerscale=1.6, labelspacing=0.3,
     )  # fmt: skip
     legend.get_title().set_color(INK)
 
 
 def physics_color(index: int, count: int) -> str:
-    """A colour of an ordered scale that can be seen on light and on dark ground."""
-    import matplotlib
-    from matplotlib.colors import to_hex
-
-    place = 0.16 + 0.66 * (index / max(count - 1, 1))
-    return to_hex(matplotlib.colormaps["plasma"](place))
+    """A colour for the value of this rank among all."""
+    return ORDERED[round(index * (len(ORDERED) - 1) / max(count - 1, 1))][0]
 
 
 def run_times(axes: Axes, bars: Sequence[tuple[Series, Mapping[str, float]]]) -> None:
@@ -222,7 +225,7 @@ def run_times(axes: Axes, bars: Sequence[tuple[Series, Mapping[str, float]]]) ->
     axes.grid(visible=False, axis="y")
     axes.grid(visible=True, axis="x")
     axes.xaxis.set_major_locator(MaxNLocator(5))
-    axes.set_xlabel("minutes: collect, fit (paler), evaluate (palest)")
+    axes.set_xlabel("minutes")
 
 
 def group_title(group: str) -> str:

@@ -53,7 +53,7 @@ def times(comparison: Comparison) -> Section:
             if not runs:
                 continue
             taken = [run_minutes(run) for run in runs]
-            minutes = {phase: np.mean([one[phase] for one in taken]) for phase in PHASES}
+            minutes = {phase: float(np.mean([one[phase] for one in taken])) for phase in PHASES}
             bars.append((series, minutes))
             cells = [_minutes(minutes[phase]) for phase in PHASES]
             cells.append(_minutes(sum(minutes.values())))
@@ -72,8 +72,8 @@ def times(comparison: Comparison) -> Section:
         columns = ["method", *(f"{phase}, min" for phase in PHASES), "all, min", "device"]
         blocks.append(Block(env, [Panel("", drawn)], Table(columns, lines)))
     lead = (
-        "Minutes per finished run, mean over seeds. They are comparable only where the runs had the"
-        " machine to themselves."
+        "Minutes per finished run, mean over seeds; from full to pale: collecting, fitting,"
+        " testing. They are comparable only where the runs had the machine to themselves."
     )
     return Section("times", "Run times", lead, blocks)
 
@@ -99,7 +99,7 @@ def sources(comparison: Comparison) -> Section:
                 done = f"{len(run.metrics)} of {run.config.collection.num_iterations}"
                 command = shlex.join(train_command(run))
                 cells = [
-                    Cell(str(run.path), command, is_code=True),
+                    Cell(str(run.path), [command], is_code=True),
                     Cell(series.label, is_key=True),
                     Cell(str(run.config.seed), is_number=True),
                     Cell(done, is_number=True),

@@ -1,15 +1,15 @@
 """What is compared: one number per run and group of physics, and curves over iterations."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
 
-from headway.experiment.tables import EpisodeRow, format_sim_params
 from headway.report import statistics
 from headway.report.page.runs import LoadedRun, Row
-from headway.report.page.scoring import References
+from headway.report.page.scoring import Outcome, by_physics, outcome
 from headway.report.page.series import Comparison, Series
 
 TRAIN = "train"
@@ -19,16 +19,6 @@ RAW_COLUMNS = (
     "env", "method", "seed", "group", "sim_params", "episodes", "return_mean", "return_std",
     "score", "run",
 )  # fmt: skip
-
-
-@dataclasses.dataclass(frozen=True)
-class Outcome:
-    """How one run did on one group after its last iteration."""
-
-    episode_return: float
-    """Mean over the group's physics, each counting once."""
-    score: float | None
-    """The same of scores; None unless references are known for all of them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,25 +36,6 @@ class Curve:
     """Steps and returns of runs that are still on their way; no part of the mean."""
 
 
-def outcome(rows: Sequence[EpisodeRow], references: References) -> Outcome:
-    """Summarise one run's test episodes of one group."""
-    returns, scores = [], []
-    for same in by_physics(rows).values():
-        returns.append(np.mean([row.episode_return for row in same]))
-        known = [references.score(row) for row in same]
-        scores.append(None if None in known else float(np.mean(known)))
-    whole = None if None in scores else float(np.mean(scores))
-    return Outcome(float(np.mean(returns)), whole)
-
-
-def by_physics(rows: Sequence[EpisodeRow]) -> dict[str, list[EpisodeRow]]:
-    """Episodes by their simulator parameters."""
-    found: dict[str, list[EpisodeRow]] = {}
-    for row in rows:
-        found.setdefault(format_sim_params(row.sim_params), []).append(row)
-    return found
-
-
 def groups(comparison: Comparison, env: str) -> list[str]:
     """The groups that were tested in an environment, training first."""
     found = dict.fromkeys(row.group for run in comparison.runs_of(env) for row in run.tests)
@@ -80,22 +51,12 @@ def curve_groups(comparison: Comparison, env: str) -> list[str]:
 
 def outcomes(comparison: Comparison, env: str, series: Series, group: str) -> list[Outcome]:
     """One outcome per finished run of a series, in the order of seeds."""
-    found = []
-    for run in comparison.runs_of(env, series):
-        rows = [row for row in run.tests if row.group == group]
-        if rows:
-            found.append(outcome(rows, comparison.references))
-    return found
+    return comparison.outcomes.get((env, series.label, group), [])
 
 
 def has_scores(comparison: Comparison, env: str) -> bool:
     """Whether every finished run of an environment has a score on every group."""
-    found = [
-        one
-        for series in comparison.series_of(env)
-        for group in groups(comparison, env)
-        for one in outcomes(comparison, env, series, group)
-    ]
+    found = [one for place, of in comparison.outcomes.items() if place[0] == env for one in of]
     return bool(found) and all(one.score is not None for one in found)
 
 
@@ -122,6 +83,14 @@ def improvement(
     if not tasks:
         return None
     return statistics.probability_of_improvement(*zip(*tasks, strict=True))
+
+
+def improvements_of(comparison: Comparison) -> dict[tuple[str, str], statistics.Estimate]:
+    """The same for all pairs of series that can be compared, by their labels, both ways round."""
+    pairs = itertools.combinations(comparison.series, 2)
+    found = {(a.label, b.label): improvement(comparison, a, b) for a, b in pairs}
+    known = {pair: estimate for pair, estimate in found.items() if estimate is not None}
+    return {**known, **{(b, a): estimate.complement for (a, b), estimate in known.items()}}
 
 
 def aggregate(comparison: Comparison, series: Series) -> statistics.Estimate | None:

@@ -16,10 +16,10 @@ class Panel:
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """A table's cell: a main text and a fainter one below."""
+    """A table's cell: a main text and fainter ones below."""
 
     text: str
-    below: str = ""
+    below: Sequence[str] = ()
     is_number: bool = False
     is_code: bool = False
     is_key: bool = False
@@ -50,6 +50,8 @@ class Block:
     panels: Sequence[Panel] = ()
     table: Table | None = None
     texts: Sequence[str] = ()
+    claims: Sequence[str] = ()
+    """What follows from the table, one sentence each."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,6 +18,16 @@ _Place = tuple[str, str, int]  # environment, physics, steps of the episode
 
 
 @dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How one run did on one group after its last iteration."""
+
+    episode_return: float
+    """Mean over the group's physics, each counting once."""
+    score: float | None
+    """The same of scores; None unless references are known for all of them."""
+
+
+@dataclasses.dataclass(frozen=True)
 class References:
     """Mean returns of `random` and `true-dynamics` for each physics."""
 
@@ -46,9 +56,7 @@ class References:
 
     def level(self, method: str, rows: Iterable[EpisodeRow]) -> float | None:
         """Mean return of a reference over the places of some episodes; None if one lacks."""
-        values = [self.returns.get((method, place)) for place in {_place(row) for row in rows}]
-        known = [value for value in values if value is not None]
-        return float(np.mean(known)) if known and len(known) == len(values) else None
+        return _mean([self.returns.get((method, place)) for place in {_place(row) for row in rows}])
 
     def describe(self, env: str) -> str:
         """Say where the references of an environment come from."""
@@ -56,6 +64,28 @@ class References:
         if methods == set(REFERENCES):
             return "normalised by the runs of random and true-dynamics given here"
         return "normalised by the project's reference returns"
+
+
+def outcome(rows: Sequence[EpisodeRow], references: References) -> Outcome:
+    """Summarise one run's test episodes of one group."""
+    parts = by_physics(rows).values()
+    returns = [np.mean([row.episode_return for row in same]) for same in parts]
+    scores = [_mean([references.score(row) for row in same]) for same in parts]
+    return Outcome(float(np.mean(returns)), _mean(scores))
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """The mean, or None where one value is missing."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known and len(known) == len(values) else None
+
+
+def by_physics(rows: Sequence[EpisodeRow]) -> dict[str, list[EpisodeRow]]:
+    """Episodes by their simulator parameters."""
+    found: dict[str, list[EpisodeRow]] = {}
+    for row in rows:
+        found.setdefault(format_sim_params(row.sim_params), []).append(row)
+    return found
 
 
 def _by_place(rows: Iterable[EpisodeRow]) -> dict[_Place, float]:

@@ -1,5 +1,8 @@
 """The chapters of the page that show how well methods do."""
 
+import dataclasses
+from collections.abc import Mapping
+
 from headway.report import statistics
 from headway.report.page import charts, svg
 from headway.report.page.measures import (
@@ -8,7 +11,7 @@ from headway.report.page.measures import (
     curve_groups,
     groups,
     has_scores,
-    improvement,
+    improvements_of,
     outcomes,
     values,
 )
@@ -37,11 +40,10 @@ def _all_environments(comparison: Comparison) -> Block | None:
     for series in comparison.series:
         found = aggregate(comparison, series)
         if found is not None:
-            cells = [_count(found.num_runs), Cell(*_value(found, "{:.2f}"), is_number=True)]
-            lines.append(Line([Cell(series.label, is_key=True), *cells], series.index))
+            lines.append(Line([_named(series, found.num_runs), _estimate(found)], series.index))
     if not lines:
         return None
-    table = Table(["method", "seeds", "score on unseen physics"], lines)
+    table = Table(["method", "score on unseen physics"], lines)
     return Block("All environments", table=table)
 
 
@@ -51,9 +53,8 @@ def _results_of(comparison: Comparison, env: str) -> Block:
     for series in comparison.series_of(env):
         cells = [_result(comparison, env, series, group) for group in tested]
         seeds = len([run for run in comparison.runs_of(env, series) if run.tests])
-        named = Cell(series.label, is_key=True)
-        lines.append(Line([named, _count(seeds), *cells], series.index))
-    columns = ["method", "seeds", *map(group_label, tested)]
+        lines.append(Line([_named(series, seeds), *cells], series.index))
+    columns = ["method", *map(group_label, tested)]
     if not tested:
         return Block(env, texts=["No run is finished yet."])
     texts = []
@@ -70,28 +71,28 @@ def _result(comparison: Comparison, env: str, series: Series, group: str) -> Cel
         return Cell("–", is_number=True)
     with_score = has_scores(comparison, env)
     main = statistics.estimate([values(comparison, env, series, group)])
-    text, interval = _value(main, "{:.2f}" if with_score else "{:,.1f}")
+    cell = _estimate(main, "{:.2f}" if with_score else "{:,.1f}")
     if not with_score:
-        return Cell(text, interval, is_number=True)
+        return cell
     returns = [one.episode_return for one in found]
     spread = statistics.standard_deviation([returns])
     below = f"return {_number(float(statistics.mean([returns])), '{:,.0f}')}"
     below += "" if spread is None else f" ± {spread:,.0f}"
-    return Cell(f"{text} ({interval})" if interval else text, below, is_number=True)
+    return dataclasses.replace(cell, below=[*cell.below, below])
 
 
-def _value(found: Estimate, form: str) -> tuple[str, str]:
-    """A value and its interval, as texts."""
+def _estimate(found: Estimate, form: str = "{:.2f}") -> Cell:
+    """A value and its interval below."""
     ends = " to ".join(_number(end, form) for end in found.interval or ())
-    return _number(found.value, form), ends
+    return Cell(_number(found.value, form), [ends] if ends else [], is_number=True)
 
 
 def _number(value: float, form: str) -> str:
     return form.format(value).replace("-", "−")
 
 
-def _count(number: int) -> Cell:
-    return Cell(str(number), is_number=True)
+def _named(series: Series, seeds: int) -> Cell:
+    return Cell(series.label, [f"{seeds} seed{'s' * (seeds != 1)}"], is_key=True)
 
 
 def _seeds(comparison: Comparison) -> Block:
@@ -109,7 +110,7 @@ def _seeds(comparison: Comparison) -> Block:
             f"Fewer than {statistics.MIN_RUNS} finished seeds: {names}. No interval is given for"
             " them, and no difference is claimed."
         )
-    texts.append(statistics.caution(min(counts.values())).strip())
+    texts.append(statistics.caution(min(counts.values())))
     return Block(texts=[text for text in texts if text])
 
 
@@ -202,26 +203,29 @@ def improvements(comparison: Comparison) -> Section:
     if len(series) < 2:
         blocks = [Block(texts=["There is one method only: nothing to compare."])]
         return Section("improvement", "Probability of improvement", lead, blocks)
+    found = improvements_of(comparison)
     lines = []
     for first in series:
-        cells = [_improvement(comparison, first, second) for second in series]
+        cells = [_improvement(found.get((first.label, second.label))) for second in series]
         lines.append(Line([Cell(first.label, is_key=True), *cells], first.index))
     table = Table(["", *(one.label for one in series)], lines)
-    first, *others = series
-    texts = []
-    if all(improvement(comparison, first, other) is None for other in others):
-        table, texts = None, ["No two methods were tested on the same unseen physics."]
-    for other in others:
-        found = improvement(comparison, first, other)
-        if found is not None:
-            texts.append(statistics.verdict(first.label, other.label, found))
-    return Section(
-        "improvement", "Probability of improvement", lead, [Block(table=table, texts=texts)]
-    )
+    first = series[0].label
+    claims = [
+        statistics.verdict(first, other, estimate)
+        for (one, other), estimate in found.items()
+        if one == first
+    ]
+    block = Block(table=table, claims=claims, texts=[_caution(found)])
+    if not found:
+        block = Block(texts=["No two methods were tested on the same unseen physics."])
+    return Section("improvement", "Probability of improvement", lead, [block])
 
 
-def _improvement(comparison: Comparison, first: Series, second: Series) -> Cell:
-    found = None if first == second else improvement(comparison, first, second)
+def _caution(found: Mapping[tuple[str, str], Estimate]) -> str:
+    return statistics.caution(min((one.num_runs for one in found.values()), default=0))
+
+
+def _improvement(found: Estimate | None) -> Cell:
     if found is None:
         return Cell("–", is_number=True)
-    return Cell(*_value(found, "{:.2f}"), is_number=True)
+    return _estimate(found)

@@ -8,7 +8,7 @@ from typing import Any
 from headway import settings
 from headway.experiment.methods import METHODS
 from headway.report.page.runs import LoadedRun, Note
-from headway.report.page.scoring import REFERENCES, References
+from headway.report.page.scoring import REFERENCES, Outcome, References, outcome
 
 _NAMES = ("env", "method", "seed")  # runs differ in these without being variants
 _SWATCHES = 8
@@ -69,6 +69,18 @@ class Comparison:
             found.setdefault((run.config.env, label), []).append(run)
         series = [Series(label, index) for index, label in enumerate(names)]
         return cls(found, series, references, list(notes))
+
+    @functools.cached_property
+    def outcomes(self) -> dict[tuple[str, str, str], list[Outcome]]:
+        """Of every finished run, by environment, label and group, in the order of seeds."""
+        found: dict[tuple[str, str, str], list[Outcome]] = {}
+        for (env, label), runs in self.runs.items():
+            for run in runs:
+                for group in dict.fromkeys(row.group for row in run.tests):
+                    rows = [row for row in run.tests if row.group == group]
+                    places = found.setdefault((env, label, group), [])
+                    places.append(outcome(rows, self.references))
+        return found
 
     @functools.cached_property
     def envs(self) -> list[str]:

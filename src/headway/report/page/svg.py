@@ -8,11 +8,14 @@ page lays panels out in as many columns as it has room for.
 import io
 import re
 from collections.abc import Callable
+from typing import Any
 
 import matplotlib
+import numpy as np
 from markupsafe import escape
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from headway.report import style
@@ -31,6 +34,13 @@ SWATCHES = (
 )
 """Colours of series in light and dark: Okabe and Ito's hues, dark enough for lines on white."""
 
+_SCALE = matplotlib.colormaps["plasma"]
+ORDERED = tuple(
+    (to_hex(_SCALE(0.08 + 0.72 * place)), to_hex(_SCALE(0.4 + 0.6 * place)))
+    for place in np.linspace(0, 1, 12)
+)
+"""Colours of ascending values in light and dark, all of them far from the ground."""
+
 MARKERS = "osD^vPX*"
 DASHES: tuple[str | tuple[int, tuple[int, ...]], ...] = ("-", (0, (5, 2)), (0, (1, 1.5)))  # type: ignore
 
@@ -41,11 +51,12 @@ THEME = {
     "axis": ("#9a9a9a", "#60616b"),
     "paper": ("#ffffff", "#17181c"),
     **{f"s{i}": pair for i, pair in enumerate(SWATCHES)},
+    **{f"p{i}": pair for i, pair in enumerate(ORDERED)},
 }
 """Variables of the style sheet: their value in light and in dark."""
 
 _VARIABLES = {light.lower(): f"var(--{name})" for name, (light, _) in THEME.items()}
-_SETTINGS = {
+_SETTINGS: dict[Any, Any] = {
     "svg.fonttype": "none",
     "text.parse_math": False,  # a dollar is a dollar
     "figure.facecolor": "none",
@@ -92,6 +103,8 @@ def _inline(document: str, name: str, label: str) -> str:
     svg = re.sub(r'(<\w+) id="', rf'\1 id="{name}-', svg)
     svg = re.sub(r' xlink:href="#', f' href="#{name}-', svg)
     svg = svg.replace('"url(#', f'"url(#{name}-')
+    wanted = set(re.findall(r'(?:href="#|url\(#)([^")]+)', svg))
+    svg = re.sub(r' id="([^"]+)"', lambda match: match[0] if match[1] in wanted else "", svg)
     svg = re.sub(r"<style.*?</style>", "", svg, flags=re.DOTALL)  # the page has it
     svg = re.sub(r" font-family: [^;\"]*;", "", svg)
     svg = re.sub(r"(\d\.\d\d)\d+", r"\1", svg)
