@@ -13,6 +13,7 @@ from headway.cli import main
 from headway.cli.comparisons import read_seeds, read_settings
 from headway.cli.usage import UsageError
 from headway.compare import reproduce
+from headway.experiment.runs import RunDir
 from headway.report.comparison import spread
 from headway.report.comparison_figure import arm_styles, has_curves
 from headway.report.comparison_runs import find
@@ -195,14 +196,19 @@ def test_dry_run_lists_and_runs_nothing(training, tmp_path, capsys):
 def test_sweep_on_the_command_line(training, tmp_path, capsys):
     code, out, _ = run(
         capsys, "sweep", *WORDS, "--seeds", "5", "--out", str(tmp_path), "--name", "mine",
-        "--methods", "pets", "tmcl", "--settings", "planner.horizon=3,5", "--json",
+        "--methods", "pets", "tmcl", "--settings", "planner.horizon=3,5", "fitting.epochs=1",
+        "--json",
     )  # fmt: skip
     assert code == 0
     assert [point["arm"] for point in json.loads(out)["returns"]] == [
         "PETS, planner.horizon 3", "PETS, planner.horizon 5",
         "T-MCL, planner.horizon 3", "T-MCL, planner.horizon 5",
     ]  # fmt: skip
-    assert (tmp_path / "mine-smoke/mine.png").exists()
+    assert "smoke`, fitting.epochs 1, seeds 5" in (tmp_path / "mine-smoke/mine.md").read_text()
+    runs = list(tmp_path.glob("runs/pendulum/*/seed5"))
+    settings = [RunDir(path).config() for path in runs]
+    assert sorted(config.planner.horizon for config in settings) == [3, 3, 5, 5]
+    assert {config.fitting.epochs for config in settings} == {1}
 
 
 @pytest.mark.parametrize(

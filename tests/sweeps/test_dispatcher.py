@@ -9,7 +9,9 @@ pytest.importorskip("ray", reason="Ray is not installed")
 
 from ray.exceptions import NodeDiedError, RayTaskError, WorkerCrashedError
 
+from headway.errors import ConfigError
 from headway.sweeps import on_ray
+from headway.sweeps.running import Workers
 from headway.sweeps.status import Status
 
 DONE = {"state": "done", "iteration": 2}
@@ -134,3 +136,37 @@ def test_what_still_runs_is_told_to_save_when_the_driver_stops(ray_of, tmp_path)
         dispatcher.run()
     # The interrupt comes while the second of the three is settled.
     assert fake.cancelled == [2]
+
+
+def nodes(*resources, alive=True):
+    return [
+        {"Alive": alive, "Resources": dict(zip(("CPU", "GPU"), r, strict=True))} for r in resources
+    ]
+
+
+@pytest.mark.parametrize(
+    ("workers", "gpus", "variables"),
+    [
+        (Workers(), 1.0, {"NPROC": "1"}),
+        (Workers(cpus_per_run=2.5), 1.0, {"NPROC": "3"}),
+        (Workers(gpus_per_run=0), 0.0, {"NPROC": "1", "JAX_PLATFORMS": "cpu"}),
+        (
+            Workers(gpus_per_run=0.5),
+            0.5,
+            {"NPROC": "1", "XLA_PYTHON_CLIENT_MEM_FRACTION": "0.450"},
+        ),
+    ],
+)
+def test_a_run_computes_with_what_it_reserves(ray_of, workers, gpus, variables):
+    ray_of().nodes = lambda: nodes((8, 0), (4, 2))
+    options = on_ray._task_options(workers)
+    assert (options["num_cpus"], options["num_gpus"]) == (workers.cpus_per_run, gpus)
+    assert options["runtime_env"]["env_vars"] == variables
+    assert options["max_retries"] == 0
+
+
+def test_a_node_must_hold_a_whole_run(ray_of):
+    fake = ray_of()
+    fake.nodes = lambda: [*nodes((8, 0), (2, 1)), *nodes((64, 8), alive=False)]
+    with pytest.raises(ConfigError, match=r"reserves 4 cores and 1 GPUs, .* at most 8 cores"):
+        on_ray._task_options(Workers(cpus_per_run=4, gpus_per_run=1))

@@ -101,9 +101,11 @@ def sweep(words: Sequence[str]) -> int:
     arguments = parse(Sweep, Sweep(), words, "headway sweep")
     from headway.sweeps.experiments import sweep_experiment
 
-    grid = read_settings(arguments.settings)
+    asked = read_settings(arguments.settings)
+    grid = {name: values for name, values in asked.items() if len(values) > 1}
+    fixed = {name: values[0] for name, values in asked.items() if len(values) == 1}
     found = sweep_experiment(arguments.name, arguments.methods, grid)
-    return _compare(found, arguments, {}, ["sweep", *words])
+    return _compare(found, arguments, fixed, ["sweep", *words])
 
 
 def _compare(

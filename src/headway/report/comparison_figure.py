@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from headway.report.comparison_runs import COLLECTED, Found, Point
-from headway.report.style import FAINT, HEADS, INK, figure, label_axis, legend
+from headway.report.style import FAINT, HEADS, INK, figure, legend
 
 COLUMNS = 3
 LineStyle = Literal["-", "--", ":"]
@@ -29,7 +29,7 @@ def draw_comparison(found: Found) -> list[Path]:
         return []
     path = comparison.folder / f"{comparison.experiment.name}.png"
     curves = has_curves(found)
-    columns = min(len(envs), COLUMNS)
+    columns = 2 if len(envs) == 4 else min(len(envs), COLUMNS)
     lines = -(-len(envs) // columns)
     height = 2.6 if curves else 0.9 + 0.32 * len(comparison.experiment.arms)
     size = (max(3.6 * columns, 6.8), height * lines + 1.4)
@@ -41,7 +41,10 @@ def draw_comparison(found: Found) -> list[Path]:
         for axes, env in zip(panels.flat, envs, strict=False):
             (_curves if curves else _dots)(axes, found, env)
             axes.set_title(env)
-        legend(drawing, _handles(found))
+        if curves:
+            for axes in panels[:, 0]:
+                axes.set_ylabel("return per episode")
+            legend(drawing, _handles(found))
     return [path, path.with_suffix(".svg")]
 
 
@@ -85,7 +88,7 @@ def _curves(axes: Axes, found: Found, env: str) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.yaxis.set_major_formatter("{x:,.6g}")
-    label_axis(axes, "environment steps collected", "return per episode")
+    axes.set_xlabel("environment steps collected")
 
 
 def _dots(axes: Axes, found: Found, env: str) -> None:
@@ -116,11 +119,13 @@ def _caption(found: Found, curves: bool) -> str:
     what = "unseen physics"
     if comparison.experiment.measure == COLLECTED:
         what = "the episodes collected for training, the first iteration at random"
-    marks = (
-        "Lines are means over seeds, bands ± 1 standard deviation."
-        if curves
-        else "Dots are seeds after the last iteration, bars their mean."
-    )
-    seeds = ", ".join(map(str, comparison.seeds))
+    seeds = comparison.seeds
+    named = f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
+    if not curves:
+        marks = "Dots are seeds after the last iteration, bars their mean."
+    elif len(seeds) > 1:
+        marks = "Lines are means over seeds, bands ± 1 standard deviation."
+    else:
+        marks = "One run per line."
     missing = f" {len(found.missing)} runs are not finished." if found.missing else ""
-    return f"Return on {what}; preset {comparison.preset}, seeds {seeds}. {marks}{missing}"
+    return f"Return on {what}; preset {comparison.preset}, {named}. {marks}{missing}"
