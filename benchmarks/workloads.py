@@ -9,6 +9,7 @@ from headway.config import FittingConfig, ModelConfig, PlannerConfig
 from headway.data import Episodes, Samples, Trajectory
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitData, FitSetup, FitState, make_data
+from headway.planning.adaptation import Prior
 from headway.planning.agent import Agent, AgentState
 from headway.tasks.base import Task
 from headway.tasks.catalog import env_spec
@@ -17,14 +18,17 @@ EPISODE_LENGTH = 200
 
 
 def make_agent(
-    num_envs: int, model: ModelConfig | None = None, planner: PlannerConfig | None = None
+    num_envs: int,
+    model: ModelConfig | None = None,
+    planner: PlannerConfig | None = None,
+    prior: Prior | None = None,
 ) -> tuple[Agent, AgentState, jax.Array]:
     """An untrained agent, its first state, and what it sees; the paper's settings by default."""
     model, planner = model or ModelConfig(), planner or PlannerConfig()
     task = env_spec("half-cheetah").make_task()
     dynamics = MultiHeadDynamics.init(model, task, key=jax.random.key(0))
     statistics = Statistics.identity(task, model.history_length)
-    agent = Agent(dynamics, statistics, task, planner, model.history_length)
+    agent = Agent(dynamics, statistics, task, planner, model.history_length, prior)
     obs = 0.1 * jax.random.normal(jax.random.key(1), (num_envs, task.obs_size))
     return agent, agent.init(num_envs, key=jax.random.key(2)), obs
 
