@@ -339,9 +339,7 @@ def load_learned(run: RunDir, config: Config) -> Learned:
     return arrays.load_tree(run.checked_checkpoint(finished - 1), template)
 
 
-def load_agent(
-    run: RunDir, config: Config | None = None, arena: Arena | None = None
-) -> Acting:
+def load_agent(run: RunDir, config: Config | None = None, arena: Arena | None = None) -> Acting:
     """The agent of a run, as trained so far.
 
     Args:

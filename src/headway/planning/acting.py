@@ -35,9 +35,7 @@ class Acting(Protocol):
         """Remember nothing yet; returns an `ActingState`."""
         ...
 
-    def act(
-        self, state: Any, obs: Float[Array | np.ndarray, "env obs"]
-    ) -> tuple[Any, Decision]:
+    def act(self, state: Any, obs: Float[Array | np.ndarray, "env obs"]) -> tuple[Any, Decision]:
         """Choose the next action of every environment."""
         ...
 

@@ -169,6 +169,7 @@ def _environment_returns(
         noise = jax.random.normal(key, (horizon, members, obs.shape[0], particles))
     else:
         noise = jax.random.split(key, horizon)
+
     def wide(values):
         spread = jnp.broadcast_to(values[..., None, None], (members, values.shape[-1], *rows[1:]))
         return spread_candidates(spread)

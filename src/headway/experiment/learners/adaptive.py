@@ -5,7 +5,6 @@ import itertools
 from contextlib import closing
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
