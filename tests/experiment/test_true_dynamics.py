@@ -168,10 +168,9 @@ def test_an_interrupted_test_on_the_simulator_goes_on_to_the_same_end(tmp_path, 
 
 def test_the_simulator_beats_random_actions(tmp_path):
     settings = {"planner.horizon": 15, "planner.num_candidates": 60, "planner.num_elites": 10}
-    settings |= {"collection.episode_length": 100, "collection.num_episodes": 8}
+    longer = {"collection.episode_length": 100, "collection.num_episodes": 8}
     returns = {}
-    for method, changes in (("random", {}), ("true-dynamics", settings)):
-        changes = {"collection.episode_length": 100, **changes}
+    for method, changes in (("random", longer), ("true-dynamics", settings | longer)):
         run = headway.train(
             "pendulum", method=method, preset="smoke", run_dir=tmp_path / method, settings=changes
         )

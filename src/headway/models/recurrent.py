@@ -45,9 +45,9 @@ class RecurrentNet(eqx.Module):
         sizes = (task.feature_size + task.action_size, *config.hidden_sizes)
         *keys, last = jax.random.split(key, len(sizes))
         layers = []
-        for key, n, m in zip(keys, sizes[:-1], sizes[1:], strict=True):
+        for one, n, m in zip(keys, sizes[:-1], sizes[1:], strict=True):
             bias = jnp.zeros((1, 4 * m)).at[:, m : 2 * m].set(FORGET_BIAS)
-            layers.append(Dense(glorot(key, (1, n + m, 4 * m)), bias))
+            layers.append(Dense(glorot(one, (1, n + m, 4 * m)), bias))
         weight = glorot(last, (1, sizes[-1], task.obs_size))
         return cls(tuple(layers), Dense(weight, jnp.zeros((1, task.obs_size))))
 

@@ -1,0 +1,92 @@
+"""GrBAL and ReBAL through the whole loop: every environment, resuming, testing again."""
+
+import numpy as np
+import pytest
+from test_training import contents, interrupt, untimed
+
+import headway
+from headway.errors import ConfigError
+from headway.experiment import training
+from headway.experiment.methods import make_config
+
+TINY = {"collection.episode_length": 30, "fitting.epochs": 2}
+SPREAD = [
+    ("grbal", "pendulum"),
+    ("grbal", "hopper"),
+    ("grbal", "slim-humanoid"),
+    ("rebal", "cartpole-swingup"),
+    ("rebal", "half-cheetah"),
+    ("rebal", "crippled-ant"),
+]
+
+
+@pytest.mark.parametrize(("method", "env"), SPREAD)
+def test_smoke_run(method, env, tmp_path):
+    run = headway.train(env, method=method, preset="smoke", run_dir=tmp_path, settings=TINY)
+    assert [m["iteration"] for m in run.metrics] == [0, 1]
+    assert np.isfinite([m["fitting"]["loss"] for m in run.metrics]).all()
+    names = ["learning_curve.png", "evaluation.png", "prediction_error.png"]
+    assert [path.name for path in run.figures] == names  # there are no heads to show
+    errors = training.RunDir(tmp_path).prediction_errors()
+    assert {row["step"] for row in errors} == {1, 2, 3, 4}
+    assert all(0 < row["error"] < np.inf for row in errors)
+    controller = headway.load(tmp_path)
+    controller.act(np.zeros(controller.agent.task.obs_size))
+    assert controller.heads is None
+
+
+@pytest.mark.parametrize("method", ["grbal", "rebal"])
+@pytest.mark.parametrize("broken", ["fit", "evaluate"])
+def test_interrupted_run_resumes_to_the_same_end(method, broken, tmp_path, monkeypatch):
+    # Blocks of one episode, so that dealing them out is repeated too.
+    settings = {**TINY, "fitting.block_transitions": 30}
+    config = make_config("pendulum", method=method, preset="smoke", settings=settings)
+    training.train_run(config, tmp_path / "whole")
+    interrupt(config, tmp_path / "cut", broken, monkeypatch)
+    training.train_run(config, tmp_path / "cut")
+    assert untimed(tmp_path / "cut") == untimed(tmp_path / "whole")
+    assert contents(tmp_path / "cut") == contents(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("method", ["grbal", "rebal"])
+def test_a_fit_that_is_cut_between_epochs_goes_on(method, tmp_path, monkeypatch):
+    config = make_config("pendulum", method=method, preset="smoke", settings=TINY)
+    training.train_run(config, tmp_path / "whole")
+    check, calls = training.check_epoch, []
+
+    def interrupted(*args):
+        calls.append(args)
+        if len(calls) == 4:  # the second epoch of the second iteration
+            raise KeyboardInterrupt
+        return check(*args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("headway.experiment.progress_store.EVERY", 0)
+        patch.setattr(training, "check_epoch", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            training.train_run(config, tmp_path / "cut")
+        patch.setattr(training, "check_epoch", lambda *args: calls.append(args) or check(*args))
+        training.train_run(config, tmp_path / "cut")
+    assert len(calls) == 5  # only the epoch that was cut is done again
+    assert contents(tmp_path / "cut") == contents(tmp_path / "whole")
+
+
+def test_sizes_are_the_papers_at_its_scale_and_smaller_in_smaller_presets():
+    sizes = {
+        (method, preset): make_config("pendulum", method=method, preset=preset).model.hidden_sizes
+        for method in ("grbal", "rebal")
+        for preset in ("paper", "quick")
+    }
+    assert sizes == {
+        ("grbal", "paper"): (512, 512, 512),
+        ("grbal", "quick"): (128, 128, 128),
+        ("rebal", "paper"): (256,),
+        ("rebal", "quick"): (128,),
+    }
+
+
+def test_settings_that_a_kind_of_model_has_not_are_refused():
+    with pytest.raises(ConfigError, match=r"kind 'recurrent' has .*'num_heads': 3.*allowed: "):
+        make_config("pendulum", method="rebal", settings={"model.num_heads": 3})
+    with pytest.raises(ConfigError, match=r"kind is 'recurent' \(did you mean 'recurrent'\?\)"):
+        make_config("pendulum", settings={"model.kind": "recurent"})

@@ -1,0 +1,37 @@
+"""What the tests of GrBAL's and ReBAL's networks share."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import toys
+from headway.config import FittingConfig, ModelConfig
+from headway.models.adapted import Window
+from headway.models.fitting import make_data
+
+TINY = ModelConfig(
+    kind="gradient-adapted",
+    num_members=1,
+    num_heads=1,
+    hidden_sizes=(5,),
+    context_size=0,
+    backward_net=False,
+    deterministic=True,
+)
+
+
+def random_window(seed, *shape):
+    rng = np.random.default_rng(seed)
+    x, delta = rng.normal(size=(*shape, 4)), rng.normal(size=(*shape, 2))
+    weight = np.ones(shape)
+    weight[..., -1] = 0.0  # padding must not count
+    return Window(*(jnp.asarray(a, jnp.float32) for a in (x, delta, weight)))
+
+
+def toy_data(gains, steps=40):
+    trajectories = [toys.random_trajectory(steps, i, gain) for i, gain in enumerate(gains)]
+    episodes, samples = toys.lay_out(trajectories, future_length=1, max_length=steps + 3)
+    statistics = toys.identity_statistics()
+    return make_data(
+        episodes, samples, statistics, FittingConfig(), num_members=1, key=jax.random.key(0)
+    ), trajectories
