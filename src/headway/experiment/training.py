@@ -15,6 +15,7 @@ from headway.config import Config
 from headway.data import ReplayBuffer, Trajectory
 from headway.errors import RunError
 from headway.experiment import arrays
+from headway.experiment.blocks import check_epoch
 from headway.experiment.evaluation import episode_rows, evaluate_agent
 from headway.experiment.interrupts import StopRequest, stop_requests
 from headway.experiment.learners import Learned, Learner, make_learner

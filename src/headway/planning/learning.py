@@ -93,7 +93,9 @@ def learn(
             suspicion = suspicion + surprise(agent.prior, observed, likelihood)
             changed = suspicion > agent.planner.change_threshold
             suspicion = jnp.where(changed, 0.0, jnp.maximum(suspicion, 0.0))
-            layer = where_env(changed, Learned.nothing(agent, len(changed)).layer, layer)
+            fresh = Learned.nothing(agent, len(changed)).layer
+            assert fresh is not None
+            layer = where_env(changed, fresh, layer)
             expected = forecast(layer, observed)
         layer = update(layer, observed, expected)
     log_evidence = learned.log_evidence

@@ -22,7 +22,6 @@ from headway.experiment.selection import (
 )
 from headway.experiment.testing import run_tests
 from headway.experiment.training import load_agent
-from headway.models.dynamics import MultiHeadDynamics
 from headway.planning.agent import Agent
 from headway.report.physics import distinct, full_label, varying
 from headway.report.tables import new_table
@@ -96,11 +95,12 @@ def diagnose(
     if collected:
         return _of_collected(run_dir, groups, num_episodes)
     tested = run_tests(run_dir, groups=groups, num_episodes=num_episodes, progress=progress)
+    assert isinstance(tested.agent, Agent)
     return _examined(Path(run_dir), tested.config, tested.agent, tested.trajectories)
 
 
 def _check_heads(run: RunDir) -> None:
-    if not isinstance(getattr(load_agent(run), "model", None), MultiHeadDynamics):
+    if run.config().model.kind != "multi-headed":
         raise ConfigError(
             f"{run.path} is a run of {run.config().method}, which has no prediction heads, allowed:"
             " methods with a multi-headed model, such as tmcl."
@@ -118,6 +118,7 @@ def _of_collected(
     run = RunDir(run_dir)
     config = run.config()
     agent = load_agent(run, config)
+    assert isinstance(agent, Agent)
     trajectories = {COLLECTED: run.iteration_data(run.finished_iterations - 1)}
     return _examined(run.path, config, agent, trajectories)
 

@@ -9,7 +9,6 @@ from jaxtyping import Float
 from headway.data import Trajectory
 from headway.experiment.runs import RunDir
 from headway.experiment.training import load_agent
-from headway.models.dynamics import MultiHeadDynamics
 from headway.planning.agent import Agent, encode
 from headway.planning.heads import RecentTransitions
 from headway.report.page.runs import LoadedRun
@@ -38,10 +37,12 @@ def embed(run: LoadedRun) -> Embedding | None:
         RunError: The run has no checkpoint or no collected data, or they are damaged.
         LimitError: The model needs more memory than is free.
     """
+    if run.config.model.kind != "multi-headed":
+        return None
     directory = RunDir(run.path)
     agent = load_agent(directory, run.config)
-    model = getattr(agent, "model", None)  # some methods have none
-    if not isinstance(model, MultiHeadDynamics) or model.context_encoder is None:
+    assert isinstance(agent, Agent)
+    if agent.model.context_encoder is None:
         return None
     chosen = moments(directory.load_data(), agent.history_length)
     contexts = encode_moments(agent, chosen)
