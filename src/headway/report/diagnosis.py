@@ -222,16 +222,14 @@ def _heads(diagnosis: Diagnosis) -> Table:
     heads = max((s.head_errors.shape[1] for s in summaries.values()), default=0)
     for head in range(heads):
         table.add_column(f"head {head}", justify="right")
+    table.add_column("best head", justify="right")
     for group, summary in summaries.items():
         for member, errors in enumerate(summary.head_errors):
-            best = int(errors.argmin())
-            cells = [
-                f"[bold]{error:.3g}[/bold]" if head == best else f"{error:.3g}"
-                for head, error in enumerate(errors)
-            ]
-            table.add_row("" if member else _group(group), str(member), *cells)
+            cells = [f"{error:.3g}" for error in errors]
+            name = "" if member else _group(group)
+            table.add_row(name, str(member), *cells, str(errors.argmin()))
         table.add_section()
-    table.caption = "mean squares in normalised units; bold: the member's best head on the group"
+    table.caption = "mean squares in normalised units; head numbers of members are unrelated"
     return table
 
 

@@ -145,7 +145,8 @@ def head_shares(axes: Axes, rows: Sequence[Row]) -> None:
         places.append(member * (heads + 0.5) + head)
         for x in range(len(physics)):
             cells.append(Rectangle((x - 0.47, places[-1] - 0.47), 0.94, 0.94))
-            colors.append(to_rgba(SWATCHES[0][0], float(shares.get((member, head, x), 0.0))))
+            share = np.clip(np.nan_to_num(shares.get((member, head, x), 0.0)), 0, 1)
+            colors.append(to_rgba(SWATCHES[0][0], float(share)))
     frames = {"edgecolor": RULE, "linewidth": 0.5}
     axes.add_collection(PatchCollection(cells, facecolor=colors, **frames))
     names = varying(physics)

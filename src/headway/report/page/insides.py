@@ -91,7 +91,8 @@ def prediction_errors(comparison: Comparison) -> Section:
     blocks = []
     for env in comparison.envs:
         runs = comparison.runs_of(env)
-        groups = dict.fromkeys(row["group"] for run in runs for row in run.prediction_errors)
+        rows = [row for run in runs for row in run.prediction_errors]
+        groups = dict.fromkeys(row["group"] for row in rows if np.isfinite(row["error"]))
         panels = [
             _errors(comparison, env, group)
             for group in sorted(groups, key=lambda group: group != TRAIN)
