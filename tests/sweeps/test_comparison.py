@@ -7,6 +7,7 @@ import re
 import fakes
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from headway.cli import main
@@ -15,8 +16,8 @@ from headway.cli.usage import UsageError
 from headway.compare import reproduce
 from headway.experiment.runs import RunDir
 from headway.report.comparison import spread
-from headway.report.comparison_figure import arm_styles, has_curves
-from headway.report.comparison_runs import find
+from headway.report.comparison_figure import _curves, arm_styles, has_curves
+from headway.report.comparison_runs import Found, Point, find
 from headway.report.comparison_statistics import verdicts
 from headway.sweeps import running
 from headway.sweeps.experiments import EXPERIMENTS, experiment
@@ -93,6 +94,33 @@ def test_one_test_per_run_is_drawn_as_dots(training, tmp_path):
     done = reproduce(asked, workers=HERE)
     assert not has_curves(done.found)
     assert b"<!-- T-MCL -->" in (tmp_path / "fig13-smoke/fig13.svg").read_bytes()
+
+
+def test_arms_of_different_length_that_are_tested_once_are_dots(training, tmp_path, monkeypatch):
+    def last_only(config, path, progress):
+        fakes.write_run(config, path)
+        kept = [row for row in RunDir(path).evaluation() if row.iteration == tested[config.method]]
+        (path / "evaluation.csv").unlink()
+        RunDir(path).append_evaluation(kept)
+
+    tested = {"mcl": 0, "tmcl": 1}
+    monkeypatch.setattr(running, "train_run", last_only)
+    done = reproduce(comparison(tmp_path, seeds=(0,)), workers=HERE)
+    assert [(p.arm, p.iteration) for p in done.found.points] == [("MCL", 0), ("T-MCL", 1)]
+    assert not has_curves(done.found)
+    assert [point.arm for point in done.found.final_points] == ["MCL", "T-MCL"]
+
+
+def test_what_learns_nothing_is_a_level_beside_curves(tmp_path):
+    points = [Point("pendulum", "MCL", 0, 0, 0, -900.0)]
+    points += [Point("pendulum", "T-MCL", 0, i, 20 * i + 20, -500.0 - i) for i in range(3)]
+    found = Found(comparison(tmp_path, seeds=(0,)), [], points, [])
+    assert has_curves(found)
+    axes = Figure().subplots()
+    _curves(axes, found, "pendulum")
+    level, curve = axes.get_lines()
+    assert list(level.get_ydata()) == [-900.0, -900.0]
+    assert list(curve.get_xdata()) == [20, 40, 60]
 
 
 def test_training_curves_show_what_was_collected(training, tmp_path):

@@ -122,6 +122,13 @@ def test_a_sweep_has_an_arm_per_method_and_combination():
     assert arms[3].settings == {"planner.horizon": 10, "fitting.epochs": 1}
 
 
+def test_two_arms_with_the_same_settings_share_one_job(tmp_path):
+    same = sweep_experiment("mine", ["tmcl"], {"fitting.weight_decay": [1, 1.0]})
+    comparison = Comparison(same, ("pendulum",), (0,), "smoke", tmp_path)
+    assert len(comparison.cells) == 2
+    assert len(comparison.jobs) == 1
+
+
 @pytest.mark.parametrize("name", ["fig13", "../up", "", "a b"])
 def test_a_sweep_cannot_take_any_name(name):
     with pytest.raises(ConfigError, match="allowed: letters"):
@@ -135,6 +142,9 @@ def test_what_is_asked_twice_or_unknown_is_refused(tmp_path):
         Comparison(experiment("fig13"), ("pendulum",), (1, 1), "smoke", tmp_path)
     with pytest.raises(ConfigError, match="envs is"):
         Comparison(experiment("fig13"), (), (1,), "smoke", tmp_path)
+    twice = ("pendulum", "headway/Pendulum-v0")
+    with pytest.raises(ConfigError, match="envs is"):
+        Comparison(experiment("fig13"), twice, (1,), "smoke", tmp_path)
     with pytest.raises(UnknownNameError, match="Did you mean 'fig13'"):
         experiment("figg13")
 

@@ -87,7 +87,7 @@ def _training_and_score(found: Found, env: str, arm: str) -> list[str]:
         groups = by_group(last)
         training += [g["return_mean"] for g in groups if g["group"] == "train"]
         unseen = [g["score"] for g in groups if g["group"] != "train"]
-        scores += [] if None in unseen else [float(np.mean(unseen))]
+        scores += [] if None in unseen or not unseen else [float(np.mean(unseen))]
     return [spread(training), "–" if not scores else f"{np.mean(scores):.2f}"]
 
 

@@ -50,7 +50,8 @@ def draw_comparison(found: Found) -> list[Path]:
 
 def has_curves(found: Found) -> bool:
     """Whether some run was measured after several iterations."""
-    return len({point.iteration for point in found.points}) > 1
+    runs = [(point.env, point.arm, point.seed) for point in found.points]
+    return len(set(runs)) < len(runs)
 
 
 def arm_styles(labels: Sequence[str]) -> dict[str, tuple[str, LineStyle]]:
@@ -80,6 +81,9 @@ def _curves(axes: Axes, found: Found, env: str) -> None:
         steps = sorted({point.timesteps for point in points})
         by_step = [[p.value for p in points if p.timesteps == step] for step in steps]
         mean = np.array([np.mean(values) for values in by_step])
+        if steps == [0]:  # nothing is learned
+            axes.axhline(mean[0], color=color, linestyle=line, linewidth=1.2)
+            continue
         if any(len(values) > 1 for values in by_step):
             std = np.array([np.std(values, ddof=len(values) > 1) for values in by_step])
             axes.fill_between(steps, mean - std, mean + std, color=color, alpha=0.13, linewidth=0)

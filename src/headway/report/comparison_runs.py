@@ -109,7 +109,7 @@ def _episodes(comparison: Comparison, cell: Cell, job: Job) -> list[Row]:
                 "return": value,
             }
             for line in metrics
-            for episode, value in enumerate(line["collection"]["returns"])
+            for episode, value in enumerate(line.get("collection", {}).get("returns", ()))
         ]
     return [
         {

@@ -88,11 +88,11 @@ class Comparison:
     """Changes of every arm by dotted name; what an arm itself sets wins."""
 
     def __post_init__(self):
+        object.__setattr__(self, "envs", tuple(env_spec(env).name for env in self.envs))
         for name in ("envs", "seeds"):
             values = getattr(self, name)
             if not values or len(set(values)) < len(values):
                 raise ConfigError(f"{name} is {values}, allowed: one or more, each once.")
-        object.__setattr__(self, "envs", tuple(env_spec(env).name for env in self.envs))
 
     @property
     def folder(self) -> Path:
