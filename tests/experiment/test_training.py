@@ -58,9 +58,7 @@ def test_smoke_run_and_evaluation_of_every_unseen_group(env, tmp_path):
         assert np.isfinite([row.episode_return for row in rows]).all()
 
 
-@pytest.mark.parametrize(
-    "method", ["tmcl-bayes", "mcl", "pets", "mh-pets", "vanilla"]
-)
+@pytest.mark.parametrize("method", ["tmcl-bayes", "mcl", "pets", "mh-pets", "vanilla"])
 def test_smoke_run_of_every_other_method(method, tmp_path):
     run = headway.train(
         "pendulum", method=method, preset="smoke", run_dir=tmp_path / method, settings=TINY

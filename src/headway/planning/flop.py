@@ -13,7 +13,7 @@ def plan_flop(
     """Floating-point operations of the matrix products of one environment's plan.
 
     The imagined rollouts are counted. Left out is what happens once per step, encoding the
-    context and choosing a head: less than a thousandth at the paper's sizes.
+    context, learning and choosing a head: less than a thousandth at the paper's sizes.
 
     Args:
         model: Settings of the networks.
@@ -34,4 +34,8 @@ def step_flop(model: ModelConfig, planner: PlannerConfig, task: Task) -> float:
     heads_of_variance = model.num_heads if planner.head_selection == "average" else 1
     outputs = 1 + (0 if model.deterministic else heads_of_variance)
     sizes = (task.feature_size + task.action_size, *model.hidden_sizes, outputs * task.obs_size)
-    return float(2 * sum(n * m for n, m in itertools.pairwise(sizes)))
+    products = sum(n * m for n, m in itertools.pairwise(sizes))
+    if planner.adaptation != "none" and planner.adaptation_variance:
+        hidden = model.hidden_sizes[-1]
+        products += hidden * (hidden + model.context_size + 1)
+    return float(2 * products)
