@@ -39,8 +39,7 @@ def test_plan_with_heads_that_learn(num_envs, arm, report):
             seconds[name].append(time.perf_counter() - start)
     added = min(seconds["learning"]) / min(seconds["frozen"]) - 1.0
     report.add(f"last layer, {arm}, {num_envs} env: added to a plan", 100.0 * added, "%")
-    state = learning[1].learned.layer
-    memory = sum(x.nbytes for x in state) / 2**20
+    memory = sum(x.nbytes for x in jax.tree.leaves(learning[1].learned)) / 2**20
     report.add(f"last layer, {arm}, {num_envs} env: memory", memory, "MiB")
 
 

@@ -66,7 +66,7 @@ def measure(
 
 def main() -> None:
     """Measure what the table lacks."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("runs", type=Path, nargs="+", help="directories of trained runs")
     parser.add_argument("--table", type=Path, required=True, help="CSV file to add rows to")
     parser.add_argument("--arms", nargs="+", default=["none", "last-layer"], choices=list(ARMS))

@@ -24,14 +24,12 @@ def old_run(tmp_path):
 
 
 def test_a_run_of_frozen_heads_is_tested_with_heads_that_learn(old_run):
-    group = headway.evaluate(old_run, num_episodes=1).rows[0].group
-    frozen, learning, again = (
-        headway.evaluate(old_run, groups=[group], num_episodes=2, settings=settings)
-        for settings in ({}, LAST_LAYER, LAST_LAYER)
+    frozen, learning = (
+        headway.evaluate(old_run, groups=["train"], num_episodes=2, settings=settings)
+        for settings in ({}, LAST_LAYER)
     )
-    returns = [[row.episode_return for row in rows] for rows in (frozen, learning, again)]
+    returns = [[row.episode_return for row in rows] for rows in (frozen, learning)]
     assert np.isfinite(returns).all()
-    assert returns[1] == returns[2]
     assert returns[0] != returns[1]
 
 

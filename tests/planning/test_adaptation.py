@@ -22,8 +22,10 @@ from headway.planning.adaptation import (
     log_likelihood,
     update,
 )
-from headway.planning.agent import Agent, reset_where
+from headway.planning.agent import Agent, encode, reset_where
+from headway.planning.imagination import ImaginedDynamics
 from headway.planning.learning import Learned
+from headway.planning.returns import RolloutSettings, candidate_returns
 
 ENVS, MEMBERS, HEADS, FEATURES, OBS = 2, 2, 3, 12, 2
 LAST_LAYER = PlannerConfig(
@@ -293,3 +295,61 @@ def test_an_agent_needs_a_prior_to_adapt():
 def test_nothing_is_remembered_where_nothing_keeps_learning():
     agent = make_agent(adaptation="none", prior=None)
     assert jax.tree.leaves(Learned.nothing(agent, 2)) == []
+
+
+def test_the_variance_in_the_plan_is_that_of_the_regression():
+    """Against φᵀPφ with φ computed by the network itself."""
+    agent = make_agent(toys.small_model(), adaptation_variance=True)
+    state, _ = play(agent, 1.0, 4)
+    layer, context = state.learned.layer, encode(agent, state.recent)
+    heads = jnp.zeros((2, 2, 1), int)
+    folded = ImaginedDynamics.fold(
+        agent.model,
+        agent.statistics,
+        heads,
+        context,
+        correction=layer.weight,
+        doubt=learning.doubt(agent, layer, heads, context),
+    )
+    rng = np.random.default_rng(0)
+    x = jnp.asarray(rng.normal(size=(2, 4, 1, 5)), jnp.float32)
+    hidden = np.asarray(agent.model.forward_net.backbone(x[:, :, 0].mT))
+    for env in range(2):
+        one = folded.with_heads(jax.tree.map(lambda leaf, env=env: leaf[env], folded.heads))
+        noise = jnp.ones((2, 2, 1, 5))
+        std = np.asarray(one.sample_delta(x, noise) - one.sample_delta(x, None))[:, :, 0]
+        plain = one.with_heads(one.heads._replace(doubt=None))
+        own = np.asarray(plain.sample_delta(x, noise) - plain.sample_delta(x, None))[:, :, 0]
+        for member, row in np.ndindex(2, 5):
+            rest = [*np.asarray(context)[member, env], 1.0]
+            phi = np.concatenate([hidden[member, row], rest])
+            root = np.asarray(layer.root)[env, member, 0]
+            scale = np.asarray(agent.prior.noise)[member]  # deltas are not scaled here
+            added = phi @ root @ root.T @ phi * scale
+            got = std[member, :, row] ** 2 - own[member, :, row] ** 2
+            np.testing.assert_allclose(got, added, rtol=2e-3, atol=1e-5)
+
+
+def test_risk_aversion_takes_deviations_over_particles_off_the_return():
+    """Two members that disagree: their returns are known one by one."""
+    gains = (0.4, 0.9)
+    candidates = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (1, 6, 3, 2)), jnp.float32)
+    obs, heads = jnp.asarray([[0.5, -0.2]]), jnp.zeros((1, 2, 1), int)
+    statistics = toys.identity_statistics()
+
+    def returns(first, second, risk_aversion=0.0):
+        model = toys.linear_model([[first * np.eye(2)], [second * np.eye(2)]])
+        return np.asarray(
+            candidate_returns(
+                ImaginedDynamics.fold(model, statistics, heads, None),
+                toys.POINT,
+                obs,
+                candidates,
+                settings=RolloutSettings(1, risk_aversion=risk_aversion),
+                key=jax.random.key(0),
+            )
+        )
+
+    alone = np.stack([returns(gain, gain) for gain in gains])
+    wanted = alone.mean(0) - 1.5 * alone.std(0)
+    np.testing.assert_allclose(returns(*gains, risk_aversion=1.5), wanted, rtol=1e-4)

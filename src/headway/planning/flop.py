@@ -13,7 +13,7 @@ def plan_flop(
     """Floating-point operations of the matrix products of one environment's plan.
 
     The imagined rollouts are counted. Left out is what happens once per step, encoding the
-    context and choosing a head: less than a thousandth at the paper's sizes.
+    context, learning and choosing a head: less than a thousandth at the paper's sizes.
 
     Args:
         model: Settings of the networks.
@@ -41,4 +41,7 @@ def step_flop(model: ModelConfig, planner: PlannerConfig, task: Task) -> float:
     products = [n * m for n, m in itertools.pairwise(sizes)]
     if model.kind == "recurrent":
         products = [4 * (n + m) * m for n, m in itertools.pairwise(sizes)]
-    return float(2 * (sum(products) + sizes[-1] * outputs * task.obs_size))
+    total = sum(products) + sizes[-1] * outputs * task.obs_size
+    if planner.adaptation != "none" and planner.adaptation_variance:
+        total += sizes[-1] * (sizes[-1] + model.context_size + 1)
+    return float(2 * total)

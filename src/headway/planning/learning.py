@@ -40,18 +40,23 @@ class Learned(NamedTuple):
     @classmethod
     def nothing(cls, agent: "Agent", num_envs: int) -> "Learned":
         """At the start of an episode."""
-        planner, heads = agent.planner, agent.model.forward_net.mean_heads
-        members, num_heads, head_size, obs_size = heads.weight.shape
         layer = log_evidence = suspicion = None
-        if agent.prior is not None and planner.adaptation != "none":
-            groups = num_heads if planner.adaptation_noise == "heads" else 1
-            sizes = num_heads, head_size + 1, obs_size
-            layer = LastLayer.of_prior(agent.prior, num_envs, sizes, groups=groups)
-            if planner.change_threshold:
+        if agent.prior is not None and agent.planner.adaptation != "none":
+            layer = untaught(agent, agent.prior, num_envs)
+            if agent.planner.change_threshold:
                 suspicion = jnp.zeros(num_envs)
         if by_evidence(agent):
-            log_evidence = jnp.zeros((num_envs, members, num_heads))
+            shape = num_envs, agent.model.num_members, agent.model.num_heads
+            log_evidence = jnp.zeros(shape)
         return cls(layer, log_evidence, suspicion)
+
+
+def untaught(agent: "Agent", prior: Prior, num_envs: int) -> LastLayer:
+    """The corrections before the first transition of an episode."""
+    _, num_heads, head_size, obs_size = agent.model.forward_net.mean_heads.weight.shape
+    groups = num_heads if agent.planner.adaptation_noise == "heads" else 1
+    sizes = num_heads, head_size + 1, obs_size
+    return LastLayer.of_prior(prior, num_envs, sizes, groups=groups)
 
 
 def by_evidence(agent: "Agent") -> bool:
@@ -79,31 +84,46 @@ def learn(
         return learned
     newest = recent.obs[:, -1], recent.action[:, -1], recent.next_obs[:, -1]
     seen = Seen.through(agent.model, agent.task, agent.statistics, newest, context)
-    layer, suspicion = learned.layer, learned.suspicion
-    if layer is None or agent.prior is None:
-        likelihood = own_log_likelihood(seen)
+    if agent.prior is None or learned.layer is None:
+        told = own_log_likelihood(seen)
     else:
         by_heads = agent.planner.adaptation_noise == "heads"
         observed = Observed.of(seen, happened, agent.prior.log_reference if by_heads else None)
-        if agent.planner.forgetting:
-            layer = forget(layer, agent.prior, agent.planner.forgetting)
+        layer, suspicion, told = teach(
+            agent, agent.prior, observed, learned.layer, learned.suspicion
+        )
+        learned = learned._replace(layer=layer, suspicion=suspicion)
+    if learned.log_evidence is None:
+        return learned
+    kept = (1.0 - 1.0 / agent.planner.selection_length) * learned.log_evidence
+    counts = happened[:, None, None] & jnp.isfinite(told)
+    return learned._replace(log_evidence=jnp.where(counts, kept + told, learned.log_evidence))
+
+
+def teach(
+    agent: "Agent",
+    prior: Prior,
+    observed: Observed,
+    layer: LastLayer,
+    suspicion: Float[Array, " env"] | None,
+) -> tuple[LastLayer, Float[Array, " env"] | None, Float[Array, "env member head"]]:
+    """Correct the heads by one transition; what was learned may be forgotten or dropped before.
+
+    Returns:
+        The corrections, the suspicion that the physics has changed, and the log-likelihood of
+        the transition before it was learned from.
+    """
+    if agent.planner.forgetting:
+        layer = forget(layer, prior, agent.planner.forgetting)
+    expected = forecast(layer, observed)
+    likelihood = log_likelihood(expected, prior.noise)
+    if suspicion is not None:
+        suspicion = suspicion + surprise(prior, observed, likelihood)
+        changed = suspicion > agent.planner.change_threshold
+        suspicion = jnp.where(changed, 0.0, jnp.maximum(suspicion, 0.0))
+        layer = where_env(changed, untaught(agent, prior, len(changed)), layer)
         expected = forecast(layer, observed)
-        likelihood = log_likelihood(expected, agent.prior.noise)
-        if suspicion is not None:
-            suspicion = suspicion + surprise(agent.prior, observed, likelihood)
-            changed = suspicion > agent.planner.change_threshold
-            suspicion = jnp.where(changed, 0.0, jnp.maximum(suspicion, 0.0))
-            fresh = Learned.nothing(agent, len(changed)).layer
-            assert fresh is not None
-            layer = where_env(changed, fresh, layer)
-            expected = forecast(layer, observed)
-        layer = update(layer, observed, expected)
-    log_evidence = learned.log_evidence
-    if log_evidence is not None:
-        kept = (1.0 - 1.0 / agent.planner.selection_length) * log_evidence
-        told = happened[:, None, None] & jnp.isfinite(likelihood)
-        log_evidence = jnp.where(told, kept + likelihood, log_evidence)
-    return Learned(layer, log_evidence, suspicion)
+    return update(layer, observed, expected), suspicion, likelihood
 
 
 def own_log_likelihood(seen: Seen) -> Float[Array, "env member head"]:

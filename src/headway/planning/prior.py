@@ -119,8 +119,8 @@ def fit_prior(
         _member_prior([_of_member(one, member, rank) for one in seen], head_noise=head_noise)
         for member in range(model.num_members)
     ]
-    columns = (np.asarray(x, np.float32) for x in zip(*of_members, strict=True))
-    return Prior(*map(jnp.asarray, columns))
+    columns = (np.stack(column) for column in zip(*of_members, strict=True))
+    return Prior(*(jnp.asarray(column, jnp.float32) for column in columns))
 
 
 class _OfMember(NamedTuple):
