@@ -34,6 +34,8 @@ PLANNER = PlannerConfig(
 )
 KINDS = ["gradient", "recurrent"]
 
+close = functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6)
+
 
 def model_of(kind, length=3, rate=0.1):
     statistics = toys.odd_statistics(TASK)
@@ -111,7 +113,7 @@ def test_the_state_goes_on_by_what_was_observed_and_done():
     for step in steps:
         x = network_input(TASK, model.statistics, step.obs, step.action)
         state, _ = model.net(state, x)
-    jax.tree.map(np.testing.assert_allclose, memory, state)
+    jax.tree.map(close, memory, state)
     now = steps[0]
     x = network_input(TASK, model.statistics, now.obs, now.action)
     delta = model.statistics.delta.denormalize(model.net(state, x)[1])
@@ -173,7 +175,6 @@ def test_an_agent_learns_from_its_steps_and_begins_every_episode_anew(kind):
         Transition(*map(jnp.asarray, (observed[t], actions[t], observed[t + 1])), jnp.ones(2, bool))
         for t in range(5)
     ]
-    close = functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6)
     jax.tree.map(close, state.memory, live(agent.model, steps))
     np.testing.assert_array_equal(play()[1], actions)  # nothing is left of the first episode
     fresh = agent.init(2, key=jax.random.key(0)).memory

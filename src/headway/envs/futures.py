@@ -50,7 +50,7 @@ class RobotFutures:
         count, horizon = actions.shape[:2]
         skip = world.frame_skip
         control = np.repeat(world.control(actions, start.sim_params), skip, axis=1)
-        rolled_out, _ = self._rollout.rollout(
+        found, _ = self._rollout.rollout(
             model,
             self._datas,
             np.tile(start.state, (count, 1)),
@@ -58,7 +58,7 @@ class RobotFutures:
             control_spec=_CONTROL,
             initial_warmstart=np.tile(start.warm, (count, 1)),
         )
-        states = np.asarray(rolled_out)
+        states = np.asarray(found)
         assert states.shape == (count, horizon * skip, mujoco.mj_stateSize(model, _PHYSICS))
         states[_given_up(states, start.state[0], model.opt.timestep)] = np.nan
         first = np.broadcast_to(start.state, (count, 1, len(start.state)))
