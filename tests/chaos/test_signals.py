@@ -14,6 +14,7 @@ from killing import ALWAYS, NEVER
 from headway.errors import BadEnvironmentError
 from headway.experiment import progress_store, resumable, training
 from headway.experiment.interrupts import Terminated
+from headway.experiment.learners import multi_headed
 from headway.experiment.progress import Progress
 
 
@@ -75,13 +76,13 @@ def test_nothing_that_was_done_is_done_again(reference, tmp_path, monkeypatch):
 def test_a_fit_in_blocks_goes_on_at_the_epoch_where_it_stopped(tmp_path, monkeypatch):
     config = killing.tiny_config(**{"fitting.block_transitions": 6})  # an episode each
     fits = []
-    fit = training.fit_blocks
+    fit = multi_headed.fit_blocks
 
     def counted(*asked, **named):
         fits.append(1)
         return fit(*asked, **named)
 
-    monkeypatch.setattr(training, "fit_blocks", counted)
+    monkeypatch.setattr(multi_headed, "fit_blocks", counted)
     training.train_run(config, tmp_path / "whole")
     whole = len(fits)
     fits.clear()
