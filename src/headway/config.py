@@ -175,6 +175,9 @@ class FittingConfig:
     """Transitions ahead that are predicted with one context (F; released code)."""
     backprop_steps: int = 100
     """Steps that the gradient flows back through time (recurrent; ReBAL)."""
+    max_rollbacks: int = 3
+    """How often in an iteration a diverging epoch is made again, with a quarter of the step size
+    each time, before the run stops."""
     backward_weight: float = 0.5
     """Weight of the backward net's loss (released code)."""
     logvar_bound_weight: float = 0.01
@@ -204,7 +207,12 @@ class FittingConfig:
         problems.at_least(1, "segment_length", "epochs", "batch_size", "future_length")
         problems.at_least(1, "block_transitions", "backprop_steps")
         problems.at_least(
-            0, "warmup_iterations", "backward_weight", "logvar_bound_weight", "weight_decay"
+            0,
+            "warmup_iterations",
+            "max_rollbacks",
+            "backward_weight",
+            "logvar_bound_weight",
+            "weight_decay",
         )
         problems.between(1e-12, 1.0, "learning_rate")
         problems.between(1e-6, 1e6, "relation_temperature")

@@ -23,7 +23,6 @@ from jaxtyping import Int, PRNGKeyArray
 
 from headway.config import Config, FittingConfig
 from headway.data import Episodes, Samples, Trajectory
-from headway.errors import DivergenceError
 from headway.experiment.methods import told_sim_params
 from headway.models.dynamics import Statistics
 from headway.models.fitting import EpochStats, FitData, FitSetup, FitState, fit_epoch, make_data
@@ -217,19 +216,6 @@ def merge_stats(parts: Sequence[EpochStats]) -> EpochStats:
     total = max(taken.sum(), 1.0)
     averages = (taken * loss).sum() / total, (taken * forward_loss).sum() / total
     return EpochStats(*averages, skipped.sum(), updates.sum())
-
-
-def check_epoch(stats: EpochStats, iteration: int, epoch: int) -> None:
-    """Stop a fit that has lost all finite numbers.
-
-    Raises:
-        DivergenceError: No update of the epoch was taken.
-    """
-    if stats.skipped == stats.updates:
-        raise DivergenceError(
-            f"no update of epoch {epoch} of iteration {iteration} had a finite loss and gradient;"
-            " try a smaller fitting.learning_rate."
-        )
 
 
 def made_ahead(make: Callable[[Item], Made], items: Iterable[Item]) -> Generator[Made, None, None]:

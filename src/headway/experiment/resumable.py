@@ -175,21 +175,23 @@ def _is_use(values: Any) -> TypeGuard[dict[str, Any]]:
     return isinstance(values, dict) and {n: type(v) for n, v in values.items()} == types
 
 
-def fit_part(state: FitState, history: list[EpochStats]) -> Part:
+def fit_part(state: FitState, history: list[EpochStats], rollbacks: int) -> Part:
     """A fit after some epochs, to be kept."""
     stats = jax.tree.map(lambda *values: np.stack(values), *history)
-    return Part({**tree_arrays(state, "state."), **tree_arrays(stats, "stats.")}, {})
+    arrays = {**tree_arrays(state, "state."), **tree_arrays(stats, "stats.")}
+    return Part(arrays, {"rollbacks": rollbacks})
 
 
-def fitted_before(store: ProgressStore, fresh: FitState) -> tuple[FitState, list[EpochStats]]:
-    """The fit that an interrupted attempt kept, or the one to begin with."""
+def fitted_before(store: ProgressStore, fresh: FitState) -> tuple[FitState, list[EpochStats], int]:
+    """The fit that an interrupted attempt kept, or the one to begin with; and its roll-backs."""
     part = store.load("fit")
     if part is None:
-        return fresh, []
+        return fresh, [], 0
     path = store.path("fit")
     try:
         columns: list[Any] = [part.arrays[f"stats.{name}"] for name in EpochStats._fields]
         history = [EpochStats(*row) for row in zip(*columns, strict=True)]
+        rollbacks = int(part.facts.get("rollbacks", 0))
     except (KeyError, TypeError, ValueError) as error:
         raise damaged(path, f"it holds no epochs: {error}") from None
-    return tree_from_arrays(fresh, part.arrays, path, "state."), history
+    return tree_from_arrays(fresh, part.arrays, path, "state."), history, rollbacks

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scipy import stats
 
-from headway.data import Trajectory
+from headway.data import Trajectory, sim_params_row
 from headway.models.dynamics import network_input
 from headway.planning.agent import Agent, choose_heads, encode
 from headway.planning.heads import RecentTransitions
@@ -127,7 +127,10 @@ def _examine(
     padding = ((0, longest - steps), (0, 0))
     obs = jnp.asarray(np.pad(trajectory.obs, padding, "edge"))
     action = jnp.asarray(np.pad(trajectory.action, padding, "edge"))
-    found = _predict(agent, obs, action, key)
+    told, names = None, agent.sim_param_names
+    if names:
+        told = jnp.broadcast_to(sim_params_row(trajectory.sim_params, names), (longest, len(names)))
+    found = _predict(agent, obs, action, told, key)
     errors, chosen, deviations = jax.tree.map(lambda x: np.asarray(x)[1:steps], found)
     if deviations is not None:
         varies = np.asarray(agent.statistics.delta.std) > 0
@@ -140,6 +143,7 @@ def _predict(
     agent: Agent,
     obs: Float[Array, "time_plus_1 obs"],
     action: Float[Array, "time action"],
+    sim_params: Float[Array, "time sim_param"] | None,
     key: PRNGKeyArray,
 ) -> tuple[
     Float[Array, "time member head"],
@@ -149,7 +153,7 @@ def _predict(
     """Errors of all heads, the selected ones, and the latter's errors in standard deviations."""
     model, statistics = agent.model, agent.statistics
     recent = _pasts(agent, obs, action)
-    context = encode(agent, recent)
+    context = encode(agent, recent, sim_params)
     head_key, error_key = jax.random.split(key)
     chosen = choose_heads(agent, recent, context, error_key=error_key, head_key=head_key)
     x = network_input(agent.task, statistics, obs[:-1], action)

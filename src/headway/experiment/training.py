@@ -13,9 +13,9 @@ from jaxtyping import PRNGKeyArray
 
 from headway.config import Config
 from headway.data import ReplayBuffer, Trajectory
-from headway.errors import RunError
+from headway.errors import DivergenceError, RunError
 from headway.experiment import arrays
-from headway.experiment.blocks import check_epoch
+from headway.experiment.divergence import SLOWER, divergence, first_non_finite
 from headway.experiment.evaluation import episode_rows, evaluate_agent
 from headway.experiment.interrupts import StopRequest, stop_requests
 from headway.experiment.learners import Learned, Learner, make_learner
@@ -181,29 +181,62 @@ class Trainer:
     def fit(self, iteration: int, key: PRNGKeyArray) -> dict[str, Any]:
         """Renew the statistics and go through the data `epochs` times.
 
+        An epoch that diverges is made again from where the last good one ended, with a smaller
+        step; the next iteration starts with the usual one.
+
         Raises:
-            DivergenceError: No update of an epoch had finite numbers.
+            DivergenceError: It diverged again and again; what was good is saved.
         """
-        fit = self.learner.fit(self.buffer.trajectories, iteration, key)
         self.phase(iteration, "fit")
-        state, history = fitted_before(self.store, self.learned.fit)
+        state, history, rollbacks = fitted_before(self.store, self.learned.fit)
         self.progress.advance(len(history))
-        done = len(history)
-        with closing(fit.epochs(state, done)) as epochs:
-            for epoch, (fitted, stats) in enumerate(epochs, done):
-                state = fitted
-                check_epoch(stats, iteration, epoch)
-                self.progress.advance(1, loss=float(stats.loss))
-                history.append(stats)
-                self.store.offer("fit", functools.partial(fit_part, state, list(history)))
+        problem: str | None = ""
+        while problem is not None:
+            learner = self.learner.slower(SLOWER**rollbacks) if rollbacks else self.learner
+            fit = learner.fit(self.buffer.trajectories, iteration, key)
+            problem = None
+            with closing(fit.epochs(state, len(history))) as epochs:
+                for fitted, stats in epochs:
+                    problem = divergence(stats, history)
+                    if problem is not None:
+                        break
+                    state = fitted
+                    self.progress.advance(1, loss=float(stats.loss))
+                    history.append(stats)
+                    kept = functools.partial(fit_part, state, list(history), rollbacks)
+                    self.store.offer("fit", kept)
+            if problem is not None:
+                rollbacks += 1
+                current = Learned(state, fit.statistics)
+                self.roll_back(
+                    problem, f"epoch {len(history)} of iteration {iteration}", rollbacks, current
+                )
         self.learned = Learned(state, fit.statistics)
         return {
             "loss": float(history[-1].loss),
             "forward_loss": float(history[-1].forward_loss),
             "updates": sum(int(stats.updates) for stats in history),
             "skipped_updates": sum(int(stats.skipped) for stats in history),
+            "rollbacks": rollbacks,
             "transitions": self.buffer.num_transitions,
         }
+
+    def roll_back(self, problem: str, epoch: str, rollbacks: int, learned: Learned) -> None:
+        """Say that an epoch is made again, or that it is no use.
+
+        Raises:
+            DivergenceError: That was once too often.
+        """
+        if rollbacks <= self.config.fitting.max_rollbacks:
+            self.progress.message(f"{epoch}: {problem}; made again with a smaller step.")
+            return
+        self.store.save()
+        trajectories = self.buffer.trajectories
+        where = first_non_finite(trajectories, self.learner.head_losses(learned, trajectories))
+        raise DivergenceError(
+            f"{epoch} diverged {rollbacks} times: {problem} ({where}); allowed: as often as"
+            " fitting.max_rollbacks says. Try a smaller fitting.learning_rate in another directory."
+        )
 
     def evaluate(
         self, iteration: int, key: PRNGKeyArray

@@ -165,13 +165,7 @@ def assign_segments(
     time = jnp.arange(steps)
 
     def assign_episode(episode: Int[Array, ""]) -> Assignment:
-        obs, action = episodes.obs[episode], episodes.action[episode]
-        row = jnp.full_like(time, episode)
-        past = episodes.history(row, time, setup.history_length)
-        physics = episodes.sim_params[row]
-        batch = Batch(obs[:-1], action, obs[1:], past, jnp.ones(steps), physics)
-        batch = jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *x.shape)), batch)
-        losses = head_losses(model, setup.task, statistics, batch)
+        losses = episode_losses(model, setup, episodes, episode, statistics)
         valid = time < episodes.length[episode]
         return Assignment(*jax.tree.map(lambda loss: winners(loss, valid), losses))
 
@@ -185,6 +179,25 @@ def assign_segments(
     empty = jnp.zeros((members, len(episodes.length), num_segments), jnp.int32)
     start = Assignment(empty, None if model.backward_net is None else empty)
     return jax.lax.fori_loop(0, episodes.count, write, start)
+
+
+def episode_losses(
+    model: MultiHeadDynamics,
+    setup: FitSetup,
+    episodes: Episodes,
+    episode: int | Int[Array, ""],
+    statistics: Statistics,
+) -> HeadLosses:
+    """Loss of every head along one episode, each transition with its own context."""
+    obs, action = episodes.obs[episode], episodes.action[episode]
+    time = jnp.arange(len(action))
+    row = jnp.full_like(time, episode)
+    past = episodes.history(row, time, setup.history_length)
+    physics = episodes.sim_params[row]
+    batch = Batch(obs[:-1], action, obs[1:], past, jnp.ones(len(action)), physics)
+    members = model.num_members
+    batch = jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *x.shape)), batch)
+    return head_losses(model, setup.task, statistics, batch)
 
 
 def gather_batch(

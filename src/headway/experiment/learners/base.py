@@ -1,8 +1,8 @@
 """What every kind of model keeps to: it begins, is fitted, acts, and says what it has learned."""
 
 import abc
-from collections.abc import Callable, Generator, Sequence
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Callable, Generator, Iterable, Sequence
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
@@ -12,6 +12,7 @@ from headway.data import Trajectory
 from headway.experiment.rollouts import Arena
 from headway.models.fitting import EpochStats
 from headway.planning.acting import Acting
+from headway.settings import override
 from headway.tasks.base import Task
 
 
@@ -75,6 +76,19 @@ class Learner(abc.ABC):
             arena: Where it acts, if that is known; only the simulator asks.
             trajectories: What it was learned from; only heads that keep learning ask.
         """
+
+    def slower(self, factor: float) -> Self:
+        """The same, but learning with smaller steps."""
+        rate = max(1e-12, factor * self.config.fitting.learning_rate)
+        config = override(self.config, {"fitting.learning_rate": rate})
+        return type(self)(config, self.task, self.episode_length)
+
+    def head_losses(
+        self, learned: Learned, trajectories: list[Trajectory]
+    ) -> Iterable[Float[np.ndarray, "member head time"]]:
+        """Loss of every head along each trajectory; none where there are no heads."""
+        del learned, trajectories
+        return ()
 
     def head_shares(
         self, learned: Learned, trajectories: list[Trajectory]

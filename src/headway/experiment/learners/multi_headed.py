@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from typing import Any
 
@@ -10,14 +10,14 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from headway.data import Trajectory
+from headway.data import Episodes, Trajectory
 from headway.experiment.blocks import BlockedData, Layout, fit_blocks
 from headway.experiment.diagnostics import head_shares, prediction_error
 from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
 from headway.experiment.methods import told_sim_params
 from headway.experiment.rollouts import Arena
 from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.models.fitting import FitSetup, FitState
+from headway.models.fitting import FitSetup, FitState, episode_losses
 from headway.planning.agent import Agent
 from headway.planning.prior import fit_prior
 
@@ -94,6 +94,16 @@ class MultiHeaded(Learner):
         planner = dataclasses.replace(self.config.planner, adaptation="none")
         model, length = learned.fit.model, self.config.model.history_length
         return Agent(model, learned.statistics, self.task, planner, length)
+
+    def head_losses(
+        self, learned: Learned, trajectories: list[Trajectory]
+    ) -> Iterable[Float[np.ndarray, "member head time"]]:
+        """See `Learner.head_losses`; one trajectory at a time."""
+        names = self.layout.sim_param_names
+        for trajectory in trajectories:
+            episode = Episodes.pad([trajectory], 1, self.episode_length, names)
+            losses = episode_losses(learned.fit.model, self.setup, episode, 0, learned.statistics)
+            yield np.asarray(losses.forward)[..., : len(trajectory)]
 
     def head_shares(
         self, learned: Learned, trajectories: list[Trajectory]
