@@ -18,7 +18,7 @@ from headway.experiment import arrays
 from headway.experiment.divergence import SLOWER, divergence, first_non_finite
 from headway.experiment.evaluation import episode_rows, evaluate_agent
 from headway.experiment.interrupts import StopRequest, stop_requests
-from headway.experiment.learners import Learned, Learner, make_learner
+from headway.experiment.learners import Fit, Learned, Learner, make_learner
 from headway.experiment.limits import MemoryNeed, check_memory, memory_need
 from headway.experiment.methods import check_block, check_options
 from headway.experiment.progress import Progress
@@ -40,6 +40,7 @@ from headway.experiment.rollouts import (
 )
 from headway.experiment.runs import RunDir
 from headway.experiment.tensorboard import write_tensorboard
+from headway.models.fitting import EpochStats
 from headway.planning.acting import Acting
 from headway.tasks.base import Task
 from headway.tasks.catalog import env_spec
@@ -190,28 +191,17 @@ class Trainer:
         self.phase(iteration, "fit")
         state, history, rollbacks = fitted_before(self.store, self.learned.fit)
         self.progress.advance(len(history))
-        problem: str | None = ""
-        while problem is not None:
+        while True:
             learner = self.learner.slower(SLOWER**rollbacks) if rollbacks else self.learner
             fit = learner.fit(self.buffer.trajectories, iteration, key)
-            problem = None
-            with closing(fit.epochs(state, len(history))) as epochs:
-                for fitted, stats in epochs:
-                    problem = divergence(stats, history)
-                    if problem is not None:
-                        break
-                    state = fitted
-                    self.progress.advance(1, loss=float(stats.loss))
-                    history.append(stats)
-                    kept = functools.partial(fit_part, state, list(history), rollbacks)
-                    self.store.offer("fit", kept)
-            if problem is not None:
-                rollbacks += 1
-                current = Learned(state, fit.statistics)
-                self.roll_back(
-                    problem, f"epoch {len(history)} of iteration {iteration}", rollbacks, current
-                )
-        self.learned = Learned(state, fit.statistics)
+            state, problem = self.fit_epochs(fit, state, history, rollbacks)
+            learned = Learned(state, fit.statistics)
+            if problem is None:
+                break
+            rollbacks += 1
+            where = f"epoch {len(history)} of iteration {iteration}"
+            self.roll_back(problem, where, rollbacks, learned)
+        self.learned = learned
         return {
             "loss": float(history[-1].loss),
             "forward_loss": float(history[-1].forward_loss),
@@ -220,6 +210,22 @@ class Trainer:
             "rollbacks": rollbacks,
             "transitions": self.buffer.num_transitions,
         }
+
+    def fit_epochs(
+        self, fit: Fit, state: Any, history: list[EpochStats], rollbacks: int
+    ) -> tuple[Any, str | None]:
+        """Run the epochs that are left; stop before one that diverges, and word why."""
+        with closing(fit.epochs(state, len(history))) as epochs:
+            for fitted, stats in epochs:
+                problem = divergence(stats, history)
+                if problem is not None:
+                    return state, problem
+                state = fitted
+                self.progress.advance(1, loss=float(stats.loss))
+                history.append(stats)
+                kept = functools.partial(fit_part, state, list(history), rollbacks)
+                self.store.offer("fit", kept)
+        return state, None
 
     def roll_back(self, problem: str, epoch: str, rollbacks: int, learned: Learned) -> None:
         """Say that an epoch is made again, or that it is no use.
