@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import itertools
-from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +16,7 @@ from headway.config import Config
 from headway.data import ReplayBuffer, Trajectory
 from headway.errors import DivergenceError, RunError
 from headway.experiment import arrays
+from headway.experiment.agents import make_agent
 from headway.experiment.blocks import BlockedData, Layout, fit_blocks
 from headway.experiment.diagnostics import head_shares, prediction_error
 from headway.experiment.evaluation import episode_rows, evaluate_agent
@@ -45,7 +45,6 @@ from headway.experiment.tensorboard import write_tensorboard
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import EpochStats, FitSetup, FitState
 from headway.planning.agent import Agent
-from headway.planning.prior import fit_prior
 from headway.tasks.base import Task
 from headway.tasks.catalog import env_spec
 
@@ -111,7 +110,9 @@ class Trainer:
     @property
     def agent(self) -> Agent:
         """The agent as learned so far."""
-        return make_agent(self.config, self.arena.task, self.learned, self.buffer.trajectories)
+        fit, statistics = self.learned
+        data = self.buffer.trajectories
+        return make_agent(self.config, self.arena.task, fit.model, statistics, data)
 
     def phase(self, iteration: int, name: str) -> None:
         """Announce what comes next."""
@@ -335,33 +336,6 @@ def check_epoch(stats: EpochStats, iteration: int, epoch: int) -> None:
         )
 
 
-def make_agent(
-    config: Config, task: Task, learned: Learned, trajectories: Sequence[Trajectory]
-) -> Agent:
-    """Join what was learned with the planner's settings.
-
-    Args:
-        config: All settings.
-        task: The Task.
-        learned: The networks and statistics.
-        trajectories: What they were learned from; heads that keep learning start from it.
-    """
-    model, statistics, planner = learned.fit.model, learned.statistics, config.planner
-    history_length = config.model.history_length
-    prior = None
-    if planner.adaptation != "none":
-        prior = fit_prior(
-            model,
-            task,
-            statistics,
-            trajectories,
-            history_length=history_length,
-            head_noise=planner.adaptation_noise == "heads",
-            rank=planner.adaptation_prior,
-        )
-    return Agent(model, statistics, task, planner, history_length, prior)
-
-
 def initial(config: Config, task: Task) -> Learned:
     """The untrained networks of a seed."""
     setup = FitSetup(task, config.fitting, config.model.history_length)
@@ -399,9 +373,9 @@ def load_agent(run: RunDir, config: Config | None = None) -> Agent:
         RunError: There is no run, it has no finished iteration, or it is damaged.
     """
     config = config or run.config()
-    learned = load_learned(run, config)
+    fit, statistics = load_learned(run, config)
     trajectories = run.load_data() if config.planner.adaptation != "none" else []
-    return make_agent(config, load_task(config), learned, trajectories)
+    return make_agent(config, load_task(config), fit.model, statistics, trajectories)
 
 
 def load_task(config: Config) -> Task:
