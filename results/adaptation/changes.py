@@ -19,11 +19,11 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from headway.experiment.loading import load_agent
 from headway.experiment.methods import config_to_evaluate
 from headway.experiment.rollouts import AgentPolicy, Arena, Episode, run_episodes
 from headway.experiment.runs import RunDir
 from headway.experiment.storage import read_csv, write_csv
-from headway.experiment.training import load_agent
 
 COLUMNS = (
     "run", "env", "seed", "arm", "settings", "step", "before", "after",

@@ -7,9 +7,9 @@ import sys
 
 import numpy as np
 
+from headway.experiment.loading import load_agent
 from headway.experiment.methods import config_to_evaluate
 from headway.experiment.runs import RunDir
-from headway.experiment.training import load_agent
 
 
 def main(run_dirs: list[str]) -> None:

@@ -14,7 +14,7 @@ import pytest
 from headway import settings
 from headway.config import Config
 from headway.errors import ConfigError, HeadwayError, RunError
-from headway.experiment import arrays, storage, training
+from headway.experiment import arrays, loading, storage, training
 from headway.experiment.runs import RunDir
 from headway.experiment.tables import EVALUATION_COLUMNS
 
@@ -33,8 +33,8 @@ def root(tmp_path) -> Path:
 @pytest.fixture(scope="module")
 def template():
     config = RunDir(DATA / "run-schema-2").config()
-    task = training.load_task(config)
-    return training.eqx.filter_eval_shape(lambda: training.initial(config, task))
+    task = loading.load_task(config)
+    return loading.eqx.filter_eval_shape(lambda: loading.initial(config, task))
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -161,7 +161,7 @@ def test_hostile_settings(root, template):
             values = json.loads(json.dumps(whole))
             (values["config"][section] if section else values["config"])[field] = value
             damage.reseal(root, "config.json", damage.sealed(values))
-            accepted_or_refused(lambda: training.need_of(RunDir(root).config()))
+            accepted_or_refused(lambda: loading.need_of(RunDir(root).config()))
 
 
 @pytest.mark.parametrize(
@@ -187,7 +187,7 @@ def test_settings_never_name_code(root):
         values["config"]["env"] = env
         damage.reseal(root, "config.json", damage.sealed(values))
         with pytest.raises(HeadwayError, match="unknown environment"):
-            training.load_agent(RunDir(root))
+            loading.load_agent(RunDir(root))
 
 
 BAD_ROWS = [

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import headway
-from headway.experiment import training
+from headway.experiment import loading
+from headway.experiment.agents import make_agent
 from headway.experiment.arrays import tree_arrays, tree_from_arrays
 from headway.experiment.methods import config_to_evaluate, make_config
 from headway.experiment.rollouts import Arena, Episode, random_policy, run_episodes
@@ -36,17 +37,17 @@ def test_a_run_of_frozen_heads_is_tested_with_heads_that_learn(old_run):
 def test_the_prior_of_a_loaded_agent_comes_from_all_its_data(old_run):
     run = RunDir(old_run)
     config = config_to_evaluate(run.config(), LAST_LAYER)
-    agent = training.load_agent(run, config)
+    agent = loading.load_agent(run, config)
     assert agent.prior.ratio.shape == (agent.model.num_members,)
-    learned, task = training.load_learned(run, config), training.load_task(config)
-    part = training.make_agent(config, task, learned, run.load_data()[:1])
+    learned, task = loading.load_learned(run, config), loading.load_task(config)
+    part = make_agent(config, task, learned.fit.model, learned.statistics, run.load_data()[:1])
     assert (part.prior.noise != agent.prior.noise).all()
-    assert training.load_agent(run).prior is None
+    assert loading.load_agent(run).prior is None
 
 
 def test_what_was_learned_survives_a_stop_in_the_middle_of_an_episode(old_run, tmp_path):
     settings = LAST_LAYER | {"planner.change_threshold": 5.0, "planner.head_selection": "evidence"}
-    agent = training.load_agent(
+    agent = loading.load_agent(
         RunDir(old_run), config_to_evaluate(RunDir(old_run).config(), settings)
     )
     state = agent.init(2, key=jax.random.key(0))

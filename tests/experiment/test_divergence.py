@@ -10,7 +10,7 @@ import pytest
 
 from headway.data import Trajectory
 from headway.errors import DivergenceError
-from headway.experiment import training
+from headway.experiment import loading, training
 from headway.experiment.divergence import divergence, first_non_finite
 from headway.experiment.learners import Learned, multi_headed
 from headway.experiment.progress import Progress
@@ -91,8 +91,8 @@ def test_what_diverges_for_good_stops_with_all_that_was_good(tmp_path, monkeypat
 
 def fresh():
     config = killing.tiny_config()
-    task = training.load_task(config)
-    return training.learner_of(config, task), training.initial(config, task)
+    task = loading.load_task(config)
+    return loading.learner_of(config, task), loading.initial(config, task)
 
 
 def episodes(scale=1.0, steps=6, *, constant=False, dtype=np.float32):

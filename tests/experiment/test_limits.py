@@ -8,7 +8,7 @@ import pytest
 
 from headway import api
 from headway.errors import LimitError
-from headway.experiment import limits, training
+from headway.experiment import limits, loading, training
 from headway.experiment.methods import make_config
 from headway.experiment.runs import RunDir
 
@@ -18,7 +18,7 @@ GIB = 2**30
 def need(**settings):
     preset = settings.pop("preset", "smoke")
     env = settings.pop("env", "pendulum")
-    return training.need_of(make_config(env, preset=preset, settings=settings))
+    return loading.need_of(make_config(env, preset=preset, settings=settings))
 
 
 def test_a_run_that_does_not_fit_is_refused_with_the_numbers(monkeypatch, tmp_path):
@@ -60,7 +60,7 @@ def test_a_model_that_does_not_fit_is_not_built(monkeypatch, tmp_path):
     config = make_config("pendulum", preset="smoke", settings=settings)
     monkeypatch.setattr(RunDir, "finished_iterations", 1)
     with pytest.raises(LimitError, match=r"over 10\^12"):
-        training.load_learned(RunDir(tmp_path), config)
+        loading.load_learned(RunDir(tmp_path), config)
 
 
 def test_the_estimate_grows_with_what_takes_the_memory():
@@ -79,8 +79,8 @@ def test_weights_are_counted(monkeypatch):
         ("slim-humanoid", {"model.deterministic": True}),
     ]:
         config = make_config(name, settings=settings)
-        task = training.load_task(config)
-        model = training.eqx.filter_eval_shape(lambda c=config, t=task: training.initial(c, t))
+        task = loading.load_task(config)
+        model = loading.eqx.filter_eval_shape(lambda c=config, t=task: loading.initial(c, t))
         leaves = training.jax.tree.leaves(model.fit.model)
         counted = sum(leaf.size for leaf in leaves)
         assert counted == pytest.approx(limits.num_parameters(config, task), rel=0.1)
@@ -145,7 +145,7 @@ config = make_config(env, preset="smoke", settings=settings)
 with tempfile.TemporaryDirectory() as folder:
     training.train_run(config, folder + "/run")
 peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-print(json.dumps({"peak": peak, "need": training.need_of(config)._asdict()}))
+print(json.dumps({"peak": peak, "need": loading.need_of(config)._asdict()}))
 """
 PLANNING = {
     "planner.num_candidates": 20_000,

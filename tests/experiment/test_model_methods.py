@@ -9,7 +9,7 @@ import pytest
 import headway
 import headway.envs
 from headway.data import Trajectory
-from headway.experiment import limits, training
+from headway.experiment import limits, loading, training
 from headway.experiment.blocks import BlockedData, Layout, fit_blocks
 from headway.experiment.methods import make_config, told_sim_params
 from headway.models.dynamics import Statistics, network_input
@@ -138,8 +138,8 @@ def test_a_run_with_new_parts_resumes_where_it_was_stopped(method, tmp_path, mon
 @pytest.mark.parametrize("method", NEW)
 def test_weights_of_every_method_are_counted(method, env):
     config = make_config(env, method=method)
-    task = training.load_task(config)
-    model = training.eqx.filter_eval_shape(lambda: training.initial(config, task)).fit.model
+    task = loading.load_task(config)
+    model = loading.eqx.filter_eval_shape(lambda: loading.initial(config, task)).fit.model
     counted = sum(leaf.size for leaf in jax.tree.leaves(model))
     assert counted == pytest.approx(limits.num_parameters(config, task), rel=0.1)
 
@@ -148,7 +148,7 @@ def test_comparing_all_contexts_takes_memory():
     pairs = {}
     for method in ("pets-cadm", "ria"):
         config = make_config("half-cheetah", method=method, settings={"fitting.batch_size": 1000})
-        task = training.load_task(config)
+        task = loading.load_task(config)
         pairs[method] = limits.memory_need(config, task, 1000).fitting
     assert pairs["ria"] - pairs["pets-cadm"] > 5 * 1000**2 * 18 * 4
 
@@ -184,12 +184,12 @@ def fitted_error(method):
             "model.history_length": 5,
         },
     )
-    task, train, names = training.load_task(config), masses(40), told_sim_params(config)
+    task, train, names = loading.load_task(config), masses(40), told_sim_params(config)
     setup = FitSetup(task, config.fitting, 5)
     statistics = Statistics.fit(task, train, 5, names)
     key = jax.random.key(0)
     data = BlockedData(train, Layout.of(config, 30), statistics, setup, 1, key)
-    state = training.initial(config, task).fit
+    state = loading.initial(config, task).fit
     state, _ = fit_blocks(state, setup, data.stream(60, key), independent=True)
     test = masses(4, seed=1)
     episodes = Layout(4, 30, names).episodes(test)

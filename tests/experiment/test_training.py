@@ -9,7 +9,7 @@ import pytest
 
 import headway
 from headway.errors import ConfigError, RunError
-from headway.experiment import arrays, training
+from headway.experiment import arrays, loading, training
 from headway.experiment.interrupts import StopRequest
 from headway.experiment.methods import make_config
 from headway.experiment.progress import Progress
@@ -248,14 +248,14 @@ def test_damaged_checkpoint_is_named(keep, reference, tmp_path):
     damaged = tmp_path / "checkpoint.safetensors"
     damaged.write_bytes(checkpoint.read_bytes()[:keep])
     config = RunDir(reference).config()
-    template = training.initial(config, training.load_task(config))
+    template = loading.initial(config, loading.load_task(config))
     with pytest.raises(RunError, match=r"checkpoint\.safetensors is damaged"):
         arrays.load_tree(damaged, template)
 
 
 def test_checkpoint_of_another_model_is_refused(reference):
     config = make_config("pendulum", preset="smoke", settings={"model.hidden_sizes": (8, 8)})
-    template = training.initial(config, training.load_task(config))
+    template = loading.initial(config, loading.load_task(config))
     with pytest.raises(RunError, match="belongs to another model"):
         arrays.load_tree(RunDir(reference).checkpoint(1), template)
 

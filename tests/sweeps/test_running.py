@@ -7,8 +7,8 @@ import pytest
 from rich.console import Console
 
 from headway.errors import ConfigError
+from headway.experiment.loading import load_task
 from headway.experiment.run_lock import locked
-from headway.experiment.training import load_task
 from headway.planning.flop import plan_flop
 from headway.sweeps import running
 from headway.sweeps.board import PlainBoard

@@ -12,11 +12,11 @@ from headway.data import Trajectory
 from headway.errors import unknown_name
 from headway.experiment.evaluation import evaluate_agent
 from headway.experiment.limits import check_memory
+from headway.experiment.loading import load_agent, need_of
 from headway.experiment.methods import config_to_evaluate
 from headway.experiment.progress import Progress
 from headway.experiment.rollouts import Arena, PlannerUse
 from headway.experiment.runs import RunDir
-from headway.experiment.training import load_agent, need_of
 from headway.planning.acting import Acting
 
 

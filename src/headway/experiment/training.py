@@ -6,21 +6,21 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from headway.config import Config
 from headway.data import ReplayBuffer, Trajectory
-from headway.errors import DivergenceError, RunError
+from headway.errors import DivergenceError
 from headway.experiment import arrays
 from headway.experiment.divergence import SLOWER, divergence, first_non_finite
 from headway.experiment.evaluation import episode_rows, evaluate_agent
 from headway.experiment.interrupts import StopRequest, stop_requests
 from headway.experiment.learners import Fit, Learned, Learner, make_learner
-from headway.experiment.limits import MemoryNeed, check_memory, memory_need
-from headway.experiment.methods import check_block, check_options
+from headway.experiment.limits import check_memory
+from headway.experiment.loading import initial, load_learned, need_of
+from headway.experiment.methods import check_block
 from headway.experiment.progress import Progress
 from headway.experiment.progress_store import ProgressStore
 from headway.experiment.resumable import (
@@ -42,8 +42,6 @@ from headway.experiment.runs import RunDir
 from headway.experiment.tensorboard import write_tensorboard
 from headway.models.fitting import EpochStats
 from headway.planning.acting import Acting
-from headway.tasks.base import Task
-from headway.tasks.catalog import env_spec
 
 
 class Keys(NamedTuple):
@@ -327,67 +325,6 @@ def train_run(
             stop.answer()
         run.partial(stop).clear()
     return run
-
-
-def need_of(config: Config) -> MemoryNeed:
-    """The memory that training a configuration needs."""
-    length = config.collection.episode_length or env_spec(config.env).episode_length
-    return memory_need(config, load_task(config), length)
-
-
-def initial(config: Config, task: Task) -> Learned:
-    """What a seed begins with, untrained."""
-    key = jax.random.fold_in(jax.random.key(config.seed), 0)
-    return learner_of(config, task).initial(key)
-
-
-def learner_of(config: Config, task: Task) -> Learner:
-    """The learner of a configuration."""
-    length = config.collection.episode_length or env_spec(config.env).episode_length
-    return make_learner(config, task, length)
-
-
-def load_learned(run: RunDir, config: Config) -> Learned:
-    """Read the newest checkpoint of a run.
-
-    Raises:
-        RunError: No iteration is finished yet, or the checkpoint is damaged.
-    """
-    finished = run.finished_iterations
-    if finished == 0:
-        raise RunError(
-            f"{run.path} has no finished iteration yet; go on training it with the same"
-            " `headway train` command."
-        )
-    task = load_task(config)
-    check_memory(need_of(config).to_load)
-    template = eqx.filter_eval_shape(lambda: initial(config, task))
-    return arrays.load_tree(run.checked_checkpoint(finished - 1), template)
-
-
-def load_agent(run: RunDir, config: Config | None = None, arena: Arena | None = None) -> Acting:
-    """The agent of a run, as trained so far.
-
-    Args:
-        run: The run.
-        config: Its settings, with those of the planner perhaps changed; as it is by default.
-        arena: Where it will act; a run on the true dynamics cannot do without.
-
-    Raises:
-        RunError: There is no run, it has no finished iteration, or it is damaged.
-        ConfigError: It is a run on the true dynamics, and there is no arena.
-    """
-    config = config or run.config()
-    learned = load_learned(run, config)
-    trajectories = run.load_data() if config.planner.adaptation != "none" else []
-    return learner_of(config, load_task(config)).agent(learned, arena, trajectories)
-
-
-def load_task(config: Config) -> Task:
-    """The Task of a configuration, with its environment's options."""
-    check_options(config)
-    spec = env_spec(config.env)
-    return spec.make_task(**{**spec.options, **config.env_options})
 
 
 def _summary(trajectories: list[Trajectory]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from rich.table import Table
 from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import ConfigError
+from headway.experiment.loading import load_agent
 from headway.experiment.progress import Progress
 from headway.experiment.runs import RunDir
 from headway.experiment.selection import (
@@ -21,7 +22,6 @@ from headway.experiment.selection import (
     summarise,
 )
 from headway.experiment.testing import run_tests
-from headway.experiment.training import load_agent
 from headway.planning.agent import Agent
 from headway.report.physics import distinct, full_label, varying
 from headway.report.tables import new_table

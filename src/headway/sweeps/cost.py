@@ -8,8 +8,8 @@ import numpy as np
 
 from headway.config import Config
 from headway.experiment.limits import num_parameters
+from headway.experiment.loading import load_task
 from headway.experiment.runs import RunDir
-from headway.experiment.training import load_task
 from headway.planning.flop import plan_flop
 from headway.sweeps.board import first_status
 from headway.sweeps.jobs import Job

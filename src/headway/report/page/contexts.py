@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from headway.data import Trajectory
+from headway.experiment.loading import load_agent
 from headway.experiment.runs import RunDir
-from headway.experiment.training import load_agent
 from headway.planning.agent import Agent, encode
 from headway.planning.heads import RecentTransitions
 from headway.report.page.runs import LoadedRun
