@@ -166,8 +166,7 @@ class FittingConfig:
     future_length: int = 5
     """Transitions ahead that are predicted with one context (F; released code)."""
     max_rollbacks: int = 3
-    """How often in an iteration a diverging epoch is made again, with a quarter of the step size
-    each time, before the run stops."""
+    """How often in an iteration a diverging epoch is made again, each time with a quarter step."""
     backward_weight: float = 0.5
     """Weight of the backward net's loss (released code)."""
     logvar_bound_weight: float = 0.01
@@ -326,11 +325,13 @@ class CollectionConfig:
     """Episodes per iteration, all stepped and planned together."""
     episode_length: int = 0
     """Steps per episode; 0 takes the environment's own."""
+    max_bad_episodes: int = 1
+    """Most episodes of an iteration that are dropped for a number that is not finite."""
 
     def __post_init__(self):
         problems = _Problems(self)
         problems.at_least(1, "num_iterations", "num_episodes")
-        problems.at_least(0, "episode_length")
+        problems.at_least(0, "episode_length", "max_bad_episodes")
         problems.report()
 
 
