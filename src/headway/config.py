@@ -176,8 +176,7 @@ class FittingConfig:
     backprop_steps: int = 100
     """Steps that the gradient flows back through time (recurrent; ReBAL)."""
     max_rollbacks: int = 3
-    """How often in an iteration a diverging epoch is made again, with a quarter of the step size
-    each time, before the run stops."""
+    """How often in an iteration a diverging epoch is made again, each time with a quarter step."""
     backward_weight: float = 0.5
     """Weight of the backward net's loss (released code)."""
     logvar_bound_weight: float = 0.01
@@ -352,11 +351,13 @@ class CollectionConfig:
     """Episodes per iteration, all stepped and planned together."""
     episode_length: int = 0
     """Steps per episode; 0 takes the environment's own."""
+    max_bad_episodes: int = 1
+    """Most episodes of an iteration that are dropped for a number that is not finite."""
 
     def __post_init__(self):
         problems = _Problems(self)
         problems.at_least(1, "num_iterations", "num_episodes")
-        problems.at_least(0, "episode_length")
+        problems.at_least(0, "episode_length", "max_bad_episodes")
         problems.report()
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import headway
-from headway.errors import ConfigError, RunError
+from headway.errors import ConfigError, PlanningError, RunError
 from headway.experiment import arrays, loading, training
 from headway.experiment.interrupts import StopRequest
 from headway.experiment.methods import make_config
@@ -234,11 +234,14 @@ def test_reset_makes_a_controller_forget(reference):
 
 
 @pytest.mark.parametrize(
-    ("obs", "says"),
-    [(np.zeros(4), r"\(4,\), allowed: \(3,\)"), (np.array([0, np.nan, 0]), r"obs\[1\] is nan")],
+    ("obs", "error", "says"),
+    [
+        (np.zeros(4), headway.ConfigError, r"\(4,\), allowed: \(3,\)"),
+        (np.array([0, np.nan, 0]), PlanningError, r"obs\[1\] is nan"),
+    ],
 )
-def test_bad_observation_is_refused(obs, says, reference):
-    with pytest.raises(headway.ConfigError, match=says):
+def test_bad_observation_is_refused(obs, error, says, reference):
+    with pytest.raises(error, match=says):
         headway.load(reference).act(obs)
 
 

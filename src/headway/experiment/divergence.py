@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from headway.data import Trajectory
+from headway.errors import DivergenceError
 from headway.models.fitting import EpochStats
 
 MAX_SKIPPED = 0.5
@@ -45,3 +46,12 @@ def first_non_finite(trajectories: Sequence[Trajectory], losses: Iterable[np.nda
             physics = dict(trajectory.sim_params)
             return f"member {member}, head {head}, at step {time} under sim_params {physics}"
     return "every member and head has a finite loss before the epoch"
+
+
+def diverged(epoch: str, rollbacks: int, problem: str, where: str) -> DivergenceError:
+    """Word the error for a fit that no roll-back has mended."""
+    return DivergenceError(
+        f"{epoch} diverged {rollbacks} times: {problem} ({where}), allowed:"
+        f" fitting.max_rollbacks ({rollbacks - 1}); try a smaller fitting.learning_rate in another"
+        " directory."
+    )

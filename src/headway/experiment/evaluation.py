@@ -11,7 +11,14 @@ from headway.config import Config
 from headway.data import Trajectory
 from headway.experiment.progress_store import ProgressStore
 from headway.experiment.resumable import resumable_episodes
-from headway.experiment.rollouts import AgentPolicy, Arena, Episode, PlannerUse, run_episodes
+from headway.experiment.rollouts import (
+    AgentPolicy,
+    Arena,
+    Episode,
+    PlannerUse,
+    accept,
+    run_episodes,
+)
 from headway.experiment.tables import EpisodeRow
 from headway.planning.acting import Acting
 from headway.planning.flop import plan_flop
@@ -111,6 +118,8 @@ def evaluate_agent(
             rollout = resumable_episodes(
                 store, f"evaluate-{chunk}", arena, side_by_side, policy, on_step
             )
+        # To leave a test out would flatter the agent, or wrong it.
+        accept(rollout, 0, lambda reason: None)
         use += rollout.use
         for (group, _), trajectory in zip(batch, rollout.trajectories, strict=True):
             found[group].append(trajectory)

@@ -157,16 +157,19 @@ def resumable_episodes(
 
 def _finished(rollout: Rollout) -> Part:
     facts = trajectory_facts(rollout.trajectories)
-    kept = {"trajectories": facts, "use": dataclasses.asdict(rollout.use)}
+    use = dataclasses.asdict(rollout.use)
+    kept = {"trajectories": facts, "use": use, "broken": list(rollout.broken)}
     return Part(trajectory_arrays(rollout.trajectories), kept)
 
 
 def _restore(part: Part, num_episodes: int, path: Path) -> Rollout:
     trajectories = trajectories_from(part.arrays, part.facts.get("trajectories"), path)
     use = part.facts.get("use")
-    if len(trajectories) != num_episodes or not _is_use(use):
+    broken = part.facts.get("broken", [])
+    texts = isinstance(broken, list) and all(isinstance(text, str) for text in broken)
+    if not texts or len(trajectories) + len(broken) != num_episodes or not _is_use(use):
         raise damaged(path, f"it does not hold {num_episodes} episodes")
-    return Rollout(trajectories, PlannerUse(**use))
+    return Rollout(trajectories, PlannerUse(**use), tuple(broken))
 
 
 def _is_use(values: Any) -> TypeGuard[dict[str, Any]]:

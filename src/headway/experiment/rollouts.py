@@ -3,9 +3,10 @@
 One vector environment and one compiled agent serve collection and evaluation alike.
 """
 
+import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -17,7 +18,7 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from headway import envs
 from headway.config import Config
 from headway.data import Trajectory
-from headway.errors import BadEnvironmentError
+from headway.errors import BadEnvironmentError, HeadwayError
 from headway.planning.acting import Acting
 from headway.planning.controller import env_action
 from headway.sim_params import SimParamSets
@@ -155,10 +156,28 @@ class PlannerUse:
 
 @dataclasses.dataclass(frozen=True)
 class Rollout:
-    """Finished episodes, in the order they were asked for."""
+    """Finished episodes, in the order they were asked for, without the broken ones."""
 
     trajectories: list[Trajectory]
     use: PlannerUse
+    broken: tuple[str, ...] = ()
+    """What was wrong with each episode that is left out."""
+
+
+def accept(rollout: Rollout, allowed: int, say: Callable[[str], None]) -> None:
+    """Say which episodes were left out, unless there are too many.
+
+    Raises:
+        BadEnvironmentError: There are more than allowed, or nothing is left.
+    """
+    broken = rollout.broken
+    if len(broken) > allowed or (broken and not rollout.trajectories):
+        raise BadEnvironmentError(
+            f"{len(broken)} episodes broke, allowed: {allowed}, and not all; the first:"
+            f" {broken[0]}. Check the environment under these physics."
+        )
+    for reason in broken:
+        say(f"{reason}; the episode is dropped.")
 
 
 def run_episodes(
@@ -175,8 +194,11 @@ def run_episodes(
         policy: Chooses the actions.
         on_step: Called after each step with the number of environments that stepped.
 
+    An episode with a number that is not finite ends there and is left out; the other
+    environments go on.
+
     Raises:
-        BadEnvironmentError: An environment returned non-finite or misshapen values.
+        BadEnvironmentError: The environment raised, or returned something misshapen.
     """
     wanted = len(episodes)
     filled = fill(episodes, arena.vector.num_envs)
@@ -186,11 +208,14 @@ def run_episodes(
     options: dict[str, Any] = {"sim_params": sim_params}
     if any(episode.schedule for episode in filled):
         options["schedule"] = [episode.schedule for episode in filled]
-    obs, _ = arena.vector.reset(seed=seeds, options=options)
-    observations, actions, rewards = [check(arena, obs, filled, "obs", 0)], [], []
+    watch = Watch(arena, filled)
+    with watch.raising("reset"):
+        obs, _ = arena.vector.reset(seed=seeds, options=options)
+    obs = watch.finite(obs, "obs", 0, np.zeros((len(filled), arena.task.obs_size)))
+    observations, actions, rewards = [obs], [], []
     length = np.zeros(len(filled), np.int64)
     terminated = np.zeros(len(filled), bool)
-    running = np.ones(len(filled), bool)
+    running = ~watch.broken
     use = PlannerUse()
     for step in range(arena.episode_length):
         started = time.perf_counter()
@@ -199,13 +224,16 @@ def run_episodes(
         use += PlannerUse.of_step(choice, running[:wanted])
         if step and choice.timed:  # the first one may compile
             use += PlannerUse(timed_steps=len(filled), seconds=seconds)
-        obs, reward, ends, cut, _ = arena.vector.step(env_action(arena.task, choice.action))
-        observations.append(check(arena, obs, filled, "obs", step + 1))
-        rewards.append(check(arena, reward, filled, "reward", step + 1))
+        with watch.raising(f"step {step + 1}"):
+            obs, reward, ends, cut, _ = arena.vector.step(env_action(arena.task, choice.action))
+        watch.running = running
+        obs = watch.finite(obs, "obs", step + 1, observations[-1])
+        observations.append(obs)
+        rewards.append(watch.finite(reward, "reward", step + 1, np.zeros(len(filled))))
         actions.append(choice.action)
         length += running
         terminated |= running & ends
-        running &= ~(ends | cut)
+        running &= ~(ends | cut | watch.broken)
         on_step(wanted)
         if not running[:wanted].any():
             break
@@ -213,8 +241,9 @@ def run_episodes(
     trajectories = [
         _cut(table, row, int(length[row]), filled[row], bool(terminated[row]))
         for row in range(wanted)
+        if not watch.broken[row]
     ]
-    return Rollout(trajectories, use)
+    return Rollout(trajectories, use, tuple(watch.reasons[row] for row in watch.rows(wanted)))
 
 
 def fill(episodes: Sequence[Episode], num_envs: int) -> list[Episode]:
@@ -222,30 +251,63 @@ def fill(episodes: Sequence[Episode], num_envs: int) -> list[Episode]:
     return [*episodes, *[episodes[-1]] * (num_envs - len(episodes))]
 
 
-def check(
-    arena: Arena, values: np.ndarray, episodes: Sequence[Episode], what: str, step: int
-) -> np.ndarray:
-    """Refuse what no model should learn from.
+class Watch:
+    """Looks at what the environments return, and notes the episodes that break."""
 
-    Raises:
-        BadEnvironmentError: Values are misshapen or not finite; the message says where.
-    """
-    values = np.asarray(values)
-    width = (arena.task.obs_size,) if what == "obs" else ()
-    allowed = (arena.vector.num_envs, *width)
-    if values.shape != allowed:
-        raise BadEnvironmentError(
-            f"{arena.spec.name} returned {what} of shape {values.shape} at step {step}, allowed:"
-            f" {allowed}; correct the environment."
-        )
-    bad = ~np.isfinite(values.reshape(len(values), -1)).all(1)
-    if bad.any():
-        physics = episodes[int(np.argmax(bad))].sim_params
-        raise BadEnvironmentError(
-            f"{arena.spec.name} returned a non-finite {what} at step {step} under sim_params"
-            f" {physics}, allowed: finite numbers; check the environment under these physics."
-        )
-    return values
+    def __init__(self, arena: Arena, episodes: Sequence[Episode]):
+        self._arena, self._episodes = arena, episodes
+        self.running = np.ones(len(episodes), bool)
+        self.reasons: dict[int, str] = {}
+
+    @property
+    def broken(self) -> Bool[np.ndarray, " env"]:
+        """The environments whose episode broke."""
+        return np.isin(np.arange(len(self._episodes)), list(self.reasons))
+
+    def rows(self, wanted: int) -> list[int]:
+        """The first `wanted` environments whose episode broke."""
+        return [row for row in range(wanted) if row in self.reasons]
+
+    @contextlib.contextmanager
+    def raising(self, when: str) -> Iterator[None]:
+        """Turn whatever an environment raises into one line.
+
+        Raises:
+            BadEnvironmentError: It raised.
+        """
+        try:
+            yield
+        except HeadwayError:
+            raise
+        except Exception as error:
+            reason = " ".join(str(error).split())[:300]
+            raise BadEnvironmentError(
+                f"{self._arena.spec.name} raised {type(error).__name__} at {when}: {reason};"
+                " correct the environment, then the same command goes on."
+            ) from error
+
+    def finite(self, values: Any, what: str, step: int, instead: np.ndarray) -> np.ndarray:
+        """What was returned, with `instead` where it is not finite; those episodes are broken.
+
+        Raises:
+            BadEnvironmentError: The values have another shape, or are no numbers.
+        """
+        name = self._arena.spec.name
+        values = np.asarray(values)
+        if values.shape != instead.shape or values.dtype.kind not in "fiub":
+            raise BadEnvironmentError(
+                f"{name} returned {what} of shape {values.shape} and type {values.dtype} at step"
+                f" {step}, allowed: numbers of shape {instead.shape}; correct the environment."
+            )
+        bad = ~np.isfinite(values.reshape(len(values), -1)).all(1)
+        for row in np.flatnonzero(bad & self.running).tolist():
+            physics = self._episodes[row].sim_params
+            self.reasons.setdefault(
+                row, f"{name} returned a non-finite {what} at step {step} under {physics}"
+            )
+        if not bad.any():
+            return values
+        return np.where(bad.reshape(-1, *[1] * (values.ndim - 1)), instead, values)
 
 
 def _cut(table, row: int, length: int, episode: Episode, terminated: bool) -> Trajectory:

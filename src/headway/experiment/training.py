@@ -12,9 +12,9 @@ from jaxtyping import PRNGKeyArray
 
 from headway.config import Config
 from headway.data import ReplayBuffer, Trajectory
-from headway.errors import DivergenceError
+from headway.errors import BadEnvironmentError, DivergenceError
 from headway.experiment import arrays
-from headway.experiment.divergence import SLOWER, divergence, first_non_finite
+from headway.experiment.divergence import SLOWER, diverged, divergence, first_non_finite
 from headway.experiment.evaluation import episode_rows, evaluate_agent
 from headway.experiment.interrupts import StopRequest, stop_requests
 from headway.experiment.learners import Fit, Learned, Learner, make_learner
@@ -36,6 +36,7 @@ from headway.experiment.rollouts import (
     Episode,
     PlannerUse,
     Policy,
+    accept,
     random_policy,
 )
 from headway.experiment.runs import RunDir
@@ -167,6 +168,9 @@ class Trainer:
         self.phase(iteration, "collect")
         advance = self.progress.advance
         rollout = resumable_episodes(self.store, "collect", arena, episodes, policy, advance)
+        if len(rollout.broken) > config.collection.max_bad_episodes:
+            self.store.drop("collect")  # for when the environment was mended
+        accept(rollout, config.collection.max_bad_episodes, self.progress.message)
         return self.keep(iteration, rollout.trajectories), rollout.use.failures
 
     def keep(self, iteration: int, collected: list[Trajectory]) -> list[Trajectory]:
@@ -234,13 +238,9 @@ class Trainer:
         if rollbacks <= self.config.fitting.max_rollbacks:
             self.progress.message(f"{epoch}: {problem}; made again with a smaller step.")
             return
-        self.store.save()
         trajectories = self.buffer.trajectories
         where = first_non_finite(trajectories, self.learner.head_losses(learned, trajectories))
-        raise DivergenceError(
-            f"{epoch} diverged {rollbacks} times: {problem} ({where}); allowed: as often as"
-            " fitting.max_rollbacks says. Try a smaller fitting.learning_rate in another directory."
-        )
+        raise diverged(epoch, rollbacks, problem, where)
 
     def evaluate(
         self, iteration: int, key: PRNGKeyArray
@@ -321,7 +321,11 @@ def train_run(
         work = [(i, trainer.amount_of_work(i)) for i in todo]
         shown.schedule([(i, name, total) for i, amounts in work for name, total in amounts.items()])
         for iteration in todo:
-            trainer.run_iteration(iteration)
+            try:
+                trainer.run_iteration(iteration)
+            except (BadEnvironmentError, DivergenceError):
+                trainer.store.save()
+                raise
             stop.answer()
         run.partial(stop).clear()
     return run
