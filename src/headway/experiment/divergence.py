@@ -1,6 +1,6 @@
 """A fit that diverges: noticed after an epoch, rolled back, and in the end explained."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -32,7 +32,7 @@ def divergence(stats: EpochStats, before: Sequence[EpochStats]) -> str | None:
     return None
 
 
-def first_non_finite(trajectories: Sequence[Trajectory], losses: Sequence[np.ndarray]) -> str:
+def first_non_finite(trajectories: Sequence[Trajectory], losses: Iterable[np.ndarray]) -> str:
     """Name the first member, head and physics whose loss is not finite; or say there is none.
 
     Args:

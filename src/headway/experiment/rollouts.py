@@ -295,10 +295,10 @@ class Watch:
                 f" {step}, allowed: numbers of shape {instead.shape}; correct the environment."
             )
         bad = ~np.isfinite(values.reshape(len(values), -1)).all(1)
-        for row in np.flatnonzero(bad & self.running):
+        for row in np.flatnonzero(bad & self.running).tolist():
             physics = self._episodes[row].sim_params
             self.reasons.setdefault(
-                int(row), f"{name} returned a non-finite {what} at step {step} under {physics}"
+                row, f"{name} returned a non-finite {what} at step {step} under {physics}"
             )
         if not bad.any():
             return values

@@ -194,8 +194,7 @@ class Trainer:
         self.phase(iteration, "fit")
         state, history, rollbacks = fitted_before(self.store, self.learned.fit)
         self.progress.advance(len(history))
-        problem: str | None = ""
-        while problem is not None:
+        while True:
             learner = self.learner.slower(SLOWER**rollbacks) if rollbacks else self.learner
             fit = learner.fit(self.buffer.trajectories, iteration, key)
             problem = None
@@ -209,13 +208,11 @@ class Trainer:
                     history.append(stats)
                     kept = functools.partial(fit_part, state, list(history), rollbacks)
                     self.store.offer("fit", kept)
-            if problem is not None:
-                rollbacks += 1
-                current = Learned(state, fit.statistics)
-                self.roll_back(
-                    problem, f"epoch {len(history)} of iteration {iteration}", rollbacks, current
-                )
-        self.learned = Learned(state, fit.statistics)
+            self.learned = Learned(state, fit.statistics)
+            if problem is None:
+                break
+            rollbacks += 1
+            self.roll_back(problem, f"epoch {len(history)} of iteration {iteration}", rollbacks)
         return {
             "loss": float(history[-1].loss),
             "forward_loss": float(history[-1].forward_loss),
@@ -225,7 +222,7 @@ class Trainer:
             "transitions": self.buffer.num_transitions,
         }
 
-    def roll_back(self, problem: str, epoch: str, rollbacks: int, learned: Learned) -> None:
+    def roll_back(self, problem: str, epoch: str, rollbacks: int) -> None:
         """Say that an epoch is made again, or that it is no use.
 
         Raises:
@@ -235,7 +232,7 @@ class Trainer:
             self.progress.message(f"{epoch}: {problem}; made again with a smaller step.")
             return
         trajectories = self.buffer.trajectories
-        where = first_non_finite(trajectories, self.learner.head_losses(learned, trajectories))
+        where = first_non_finite(trajectories, self.learner.head_losses(self.learned, trajectories))
         raise diverged(epoch, rollbacks, problem, where)
 
     def evaluate(
