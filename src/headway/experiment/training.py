@@ -197,13 +197,11 @@ class Trainer:
             learner = self.learner.slower(SLOWER**rollbacks) if rollbacks else self.learner
             fit = learner.fit(self.buffer.trajectories, iteration, key)
             state, problem = self.fit_epochs(fit, state, history, rollbacks)
-            learned = Learned(state, fit.statistics)
+            self.learned = Learned(state, fit.statistics)
             if problem is None:
                 break
             rollbacks += 1
-            where = f"epoch {len(history)} of iteration {iteration}"
-            self.roll_back(problem, where, rollbacks, learned)
-        self.learned = learned
+            self.roll_back(problem, f"epoch {len(history)} of iteration {iteration}", rollbacks)
         return {
             "loss": float(history[-1].loss),
             "forward_loss": float(history[-1].forward_loss),
@@ -229,7 +227,7 @@ class Trainer:
                 self.store.offer("fit", kept)
         return state, None
 
-    def roll_back(self, problem: str, epoch: str, rollbacks: int, learned: Learned) -> None:
+    def roll_back(self, problem: str, epoch: str, rollbacks: int) -> None:
         """Say that an epoch is made again, or that it is no use.
 
         Raises:
@@ -239,7 +237,7 @@ class Trainer:
             self.progress.message(f"{epoch}: {problem}; made again with a smaller step.")
             return
         trajectories = self.buffer.trajectories
-        where = first_non_finite(trajectories, self.learner.head_losses(learned, trajectories))
+        where = first_non_finite(trajectories, self.learner.head_losses(self.learned, trajectories))
         raise diverged(epoch, rollbacks, problem, where)
 
     def evaluate(
