@@ -5,12 +5,12 @@ released code. A setting is addressed as `section.name`, for example `planner.ho
 """
 
 import dataclasses
-import difflib
 import typing
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from headway.errors import ConfigError, shown
+from headway.errors import shown
+from headway.problems import Problems
 from headway.sim_params import SimParamSets
 
 Oracle = Literal["independent", "transition", "trajectory"]
@@ -21,10 +21,6 @@ ContextKind = Literal["learned", "history", "sim-params"]
 ContextPlace = Literal["input", "last-hidden", "head"]
 Adaptation = Literal["none", "last-layer"]
 
-LARGEST = 10**9
-"""No number of anything is larger; a file that says so is wrong, or means harm."""
-MAX_LAYERS = 64
-"""Hidden layers of a network."""
 PLAIN: Mapping[str, Any] = {
     "num_members": 1,
     "num_heads": 1,
@@ -33,54 +29,6 @@ PLAIN: Mapping[str, Any] = {
     "deterministic": True,
 }
 """Settings of every kind of model that is no multi-headed ensemble."""
-
-
-class _Problems:
-    """Collects what is wrong with one section, so that all of it is reported at once."""
-
-    def __init__(self, section: Any):
-        self._section = section
-        self._found: list[str] = []
-
-    def at_least(self, minimum: float, *names: str) -> None:
-        for name in names:
-            value = getattr(self._section, name)
-            if not minimum <= value:
-                self._found.append(f"{name} is {shown(value)}, allowed: at least {minimum}")
-            elif value > LARGEST:
-                self._found.append(f"{name} is {shown(value)}, allowed: at most {LARGEST:,}")
-
-    def between(self, low: float, high: float, *names: str) -> None:
-        for name in names:
-            value = getattr(self._section, name)
-            if not low <= value <= high:
-                self._found.append(f"{name} is {shown(value)}, allowed: {low} to {high}")
-
-    def one_of(self, name: str, allowed: tuple[str, ...]) -> None:
-        value = getattr(self._section, name)
-        if value not in allowed:
-            close = difflib.get_close_matches(str(value)[:80], allowed, n=1)
-            hint = f" (did you mean {close[0]!r}?)" if close else ""
-            self._found.append(f"{name} is {shown(value)}{hint}, allowed: {', '.join(allowed)}")
-
-    def sizes(self, name: str) -> None:
-        value = getattr(self._section, name)
-        if not value or any(size < 1 for size in value):
-            found = f"{name} is {shown(value)}, allowed: one or more widths of at least 1"
-            self._found.append(found)
-        elif len(value) > MAX_LAYERS or max(value) > LARGEST:
-            found = f"{name} is {shown(value)}, allowed: {MAX_LAYERS} widths up to {LARGEST:,}"
-            self._found.append(found)
-
-    def require(self, condition: bool, text: str) -> None:
-        if not condition:
-            self._found.append(text)
-
-    def report(self) -> None:
-        if self._found:
-            section = type(self._section).__name__.removesuffix("Config").lower()
-            settings = f"{section} settings".lstrip()
-            raise ConfigError(f"bad {settings}: {'; '.join(self._found)}.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,7 +73,7 @@ class ModelConfig:
     """Size of that step (gradient-adapted; GrBAL)."""
 
     def __post_init__(self):
-        problems = _Problems(self)
+        problems = Problems(self)
         problems.at_least(1, "num_members", "num_heads", "history_length")
         problems.at_least(1, "adaptation_length")
         problems.between(1e-12, 1.0, "adaptation_rate")
@@ -202,7 +150,7 @@ class FittingConfig:
     """Whether the first anchor of every trajectory is left out (a defect of the released code)."""
 
     def __post_init__(self):
-        problems = _Problems(self)
+        problems = Problems(self)
         problems.at_least(1, "segment_length", "epochs", "batch_size", "future_length")
         problems.at_least(1, "block_transitions", "backprop_steps")
         problems.at_least(
@@ -304,7 +252,7 @@ class PlannerConfig:
     particles."""
 
     def __post_init__(self):
-        problems = _Problems(self)
+        problems = Problems(self)
         problems.at_least(
             1, "horizon", "num_candidates", "num_elites", "num_iterations", "num_particles"
         )
@@ -355,7 +303,7 @@ class CollectionConfig:
     """Most episodes of an iteration that are dropped for a number that is not finite."""
 
     def __post_init__(self):
-        problems = _Problems(self)
+        problems = Problems(self)
         problems.at_least(1, "num_iterations", "num_episodes")
         problems.at_least(0, "episode_length", "max_bad_episodes")
         problems.report()
@@ -375,7 +323,7 @@ class EvaluationConfig:
     """Seed of the first test episode; the others follow it."""
 
     def __post_init__(self):
-        problems = _Problems(self)
+        problems = Problems(self)
         problems.at_least(1, "every")
         problems.between(1, 1000, "num_episodes")
         problems.between(0, 2**30, "seed")
@@ -411,7 +359,7 @@ class Config:
     """Testing."""
 
     def __post_init__(self):
-        problems = _Problems(self)
+        problems = Problems(self)
         problems.between(0, 2**31 - 1, "seed")
         problems.require(
             self.planner.num_particles % self.model.num_members == 0,
