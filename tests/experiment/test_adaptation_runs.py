@@ -9,7 +9,6 @@ import pytest
 
 import headway
 from headway.experiment import loading
-from headway.experiment.agents import make_agent
 from headway.experiment.arrays import tree_arrays, tree_from_arrays
 from headway.experiment.methods import config_to_evaluate, make_config
 from headway.experiment.rollouts import Arena, Episode, random_policy, run_episodes
@@ -40,7 +39,8 @@ def test_the_prior_of_a_loaded_agent_comes_from_all_its_data(old_run):
     agent = loading.load_agent(run, config)
     assert agent.prior.ratio.shape == (agent.model.num_members,)
     learned, task = loading.load_learned(run, config), loading.load_task(config)
-    part = make_agent(config, task, learned.fit.model, learned.statistics, run.load_data()[:1])
+    learner = loading.learner_of(config, task)
+    part = learner.agent(learned, trajectories=run.load_data()[:1])
     assert (part.prior.noise != agent.prior.noise).all()
     assert loading.load_agent(run).prior is None
 

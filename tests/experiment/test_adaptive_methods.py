@@ -52,7 +52,7 @@ def test_interrupted_run_resumes_to_the_same_end(method, broken, tmp_path, monke
 def test_a_fit_that_is_cut_between_epochs_goes_on(method, tmp_path, monkeypatch):
     config = make_config("pendulum", method=method, preset="smoke", settings=TINY)
     training.train_run(config, tmp_path / "whole")
-    check, calls = training.check_epoch, []
+    check, calls = training.divergence, []
 
     def interrupted(*args):
         calls.append(args)
@@ -62,10 +62,10 @@ def test_a_fit_that_is_cut_between_epochs_goes_on(method, tmp_path, monkeypatch)
 
     with monkeypatch.context() as patch:
         patch.setattr("headway.experiment.progress_store.EVERY", 0)
-        patch.setattr(training, "check_epoch", interrupted)
+        patch.setattr(training, "divergence", interrupted)
         with pytest.raises(KeyboardInterrupt):
             training.train_run(config, tmp_path / "cut")
-        patch.setattr(training, "check_epoch", lambda *args: calls.append(args) or check(*args))
+        patch.setattr(training, "divergence", lambda *args: calls.append(args) or check(*args))
         training.train_run(config, tmp_path / "cut")
     assert len(calls) == 5  # only the epoch that was cut is done again
     assert contents(tmp_path / "cut") == contents(tmp_path / "whole")

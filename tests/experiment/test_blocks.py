@@ -259,7 +259,7 @@ def test_an_error_in_the_background_reaches_the_caller():
 def test_the_papers_data_are_one_block(env):
     config = make_config(env)
     length = env_spec(env).episode_length
-    assert Layout.of(config, length) == (100, length)
+    assert Layout.of(config, length)[:2] == (100, length)
 
 
 def test_padding_counts_towards_the_size_of_a_block():
@@ -268,9 +268,9 @@ def test_padding_counts_towards_the_size_of_a_block():
         collection=CollectionConfig(num_iterations=10, num_episodes=10),
         fitting=FittingConfig(block_transitions=4100),
     )
-    assert Layout.of(config, 1000) == (4, 1000)
-    assert Layout.of(config, 41) == (100, 41)
-    assert Layout.of(config, 42) == (97, 42)
+    assert Layout.of(config, 1000)[:2] == (4, 1000)
+    assert Layout.of(config, 41)[:2] == (100, 41)
+    assert Layout.of(config, 42)[:2] == (97, 42)
 
 
 def test_head_shares_by_blocks_are_those_of_all_data():

@@ -313,7 +313,7 @@ def test_the_variance_in_the_plan_is_that_of_the_regression():
     )
     rng = np.random.default_rng(0)
     x = jnp.asarray(rng.normal(size=(2, 4, 1, 5)), jnp.float32)
-    hidden = np.asarray(agent.model.forward_net.backbone(x[:, :, 0].mT))
+    hidden = np.asarray(agent.model.forward_net.head_input(x[:, :, 0].mT, None))
     for env in range(2):
         one = folded.with_heads(jax.tree.map(lambda leaf, env=env: leaf[env], folded.heads))
         noise = jnp.ones((2, 2, 1, 5))

@@ -65,10 +65,10 @@ def test_what_diagnose_refuses(run_dir, words, said, capsys):
     assert said in capsys.readouterr().err
 
 
-def test_only_models_with_heads_are_diagnosed(run_dir, monkeypatch):
-    monkeypatch.setattr(diagnosis, "load_agent", lambda run: object())
-    with pytest.raises(ConfigError, match="a run of tmcl, which has no prediction heads"):
-        headway.diagnose(run_dir)
+def test_only_models_with_heads_are_diagnosed(tmp_path):
+    run = headway.train("pendulum", method="random", preset="smoke", run_dir=tmp_path / "run")
+    with pytest.raises(ConfigError, match="a run of random, which has no prediction heads"):
+        headway.diagnose(run.path)
 
 
 def test_only_runs_are_diagnosed(tmp_path, capsys):

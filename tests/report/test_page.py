@@ -15,7 +15,6 @@ import headway
 from headway.cli import main
 from headway.errors import ConfigError, RunError, UnknownNameError
 from headway.experiment.runs import RunDir
-from headway.report.page import contexts
 from headway.report.page.build import SECTIONS, write_report
 from headway.report.page.contexts import principal_components, variance_between
 from headway.report.page.runs import load_runs, train_command
@@ -239,10 +238,10 @@ def test_colours_follow_the_theme(tmp_path):
     assert len(used) == len(physics) > 1
 
 
-def test_a_method_without_a_model_has_no_contexts(tmp_path, monkeypatch):
-    monkeypatch.setattr(contexts, "load_agent", lambda run, config: object())
-    page = write_report([SAMPLE], tmp_path / "report.html", only=["contexts"]).read_text()
-    assert "No learned context: tmcl, seed 0." in page
+def test_a_method_without_a_model_has_no_contexts(tmp_path):
+    run = headway.train("pendulum", method="random", preset="smoke", run_dir=tmp_path / "run")
+    page = write_report([run.path], tmp_path / "report.html", only=["contexts"]).read_text()
+    assert "No learned context: random, seed 0." in page
 
 
 def test_principal_components():
