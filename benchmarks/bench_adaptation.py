@@ -22,8 +22,7 @@ ARMS = {
 }
 
 
-@pytest.mark.parametrize("arm", ARMS)
-@pytest.mark.parametrize("num_envs", [1, 10])
+@pytest.mark.parametrize(("num_envs", "arm"), [*((1, arm) for arm in ARMS), (10, "constant noise")])
 def test_plan_with_heads_that_learn(num_envs, arm, report):
     """Frozen and learning heads take turns, and the least time of each counts."""
     planner = PlannerConfig(adaptation="last-layer", **ARMS[arm])
