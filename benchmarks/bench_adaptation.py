@@ -9,9 +9,9 @@ import pytest
 from workloads import make_agent
 
 from headway.config import PlannerConfig
-from headway.planning.adaptation import Prior
 from headway.planning.agent import encode
-from headway.planning.learning import learn
+from headway.planning.last_layer.learning import learn
+from headway.planning.last_layer.regression import Prior
 
 ROUNDS = 3
 ARMS = {

@@ -9,8 +9,8 @@ from headway.config import FittingConfig, ModelConfig, PlannerConfig
 from headway.data import Episodes, Samples, Trajectory
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitData, FitSetup, FitState, make_data
-from headway.planning.adaptation import Prior
 from headway.planning.agent import Agent, AgentState
+from headway.planning.last_layer.regression import Prior
 from headway.tasks.base import Task
 from headway.tasks.catalog import env_spec
 

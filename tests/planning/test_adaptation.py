@@ -11,8 +11,11 @@ import toys
 from headway.config import PlannerConfig
 from headway.errors import ConfigError
 from headway.models.dynamics import MultiHeadDynamics
-from headway.planning import learning
-from headway.planning.adaptation import (
+from headway.planning.agent import Agent, encode, reset_where
+from headway.planning.imagination import ImaginedDynamics
+from headway.planning.last_layer import learning
+from headway.planning.last_layer.learning import Learned
+from headway.planning.last_layer.regression import (
     LastLayer,
     Observed,
     Prior,
@@ -22,9 +25,6 @@ from headway.planning.adaptation import (
     log_likelihood,
     update,
 )
-from headway.planning.agent import Agent, encode, reset_where
-from headway.planning.imagination import ImaginedDynamics
-from headway.planning.learning import Learned
 from headway.planning.returns import RolloutSettings, candidate_returns
 
 ENVS, MEMBERS, HEADS, FEATURES, OBS = 2, 2, 3, 12, 2

@@ -14,9 +14,9 @@ from headway.config import ModelConfig, PlannerConfig
 from headway.models.adapted import ReluNet, Window, adapt
 from headway.models.dynamics import network_input
 from headway.models.recurrent import RecurrentNet
-from headway.planning.adaptive import GradientAdapted, Recurrent, Transition
-from headway.planning.adaptive_agent import AdaptiveAgent, imagine
 from headway.planning.heads import RecentTransitions
+from headway.planning.meta.agent import AdaptiveAgent, imagine
+from headway.planning.meta.models import GradientAdapted, Recurrent, Transition
 from headway.planning.returns import RolloutSettings, candidate_returns
 
 TASK = toys.ScaledTask()

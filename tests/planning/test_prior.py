@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import toys
-from headway.planning import prior as prior_module
-from headway.planning.prior import Evidence, fit_prior
+from headway.planning.last_layer import prior as prior_module
+from headway.planning.last_layer.prior import Evidence, fit_prior
 
 FEATURES, OBS, STEPS = 6, 2, 30
 

@@ -14,11 +14,10 @@ from headway.data import sim_params_row
 from headway.errors import ConfigError
 from headway.models.compilation import jit_networks
 from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.planning.adaptation import Prior
 from headway.planning.devices import whole_on_each
 from headway.planning.heads import RecentTransitions, head_errors, select_heads
 from headway.planning.imagination import ImaginedDynamics
-from headway.planning.learning import (
+from headway.planning.last_layer.learning import (
     Learned,
     by_evidence,
     corrected_errors,
@@ -26,6 +25,7 @@ from headway.planning.learning import (
     heads_by_evidence,
     learn,
 )
+from headway.planning.last_layer.regression import Prior
 from headway.planning.optimizers import Plan, Score, SearchState, make_optimizer, where_env
 from headway.planning.returns import RolloutSettings, candidate_returns
 from headway.tasks.base import Task
@@ -74,13 +74,13 @@ class Agent(eqx.Module):
     planner: PlannerConfig = eqx.field(static=True)
     history_length: int = eqx.field(static=True)
     prior: Prior | None = None
-    """Where heads that keep learning start; `prior.fit_prior` finds it."""
+    """Where heads that keep learning start; `last_layer.prior.fit_prior` finds it."""
 
     def __check_init__(self):
         if self.planner.adaptation != "none" and self.prior is None:
             raise ConfigError(
                 "planner.adaptation is 'last-layer', but the agent has no prior; make it with"
-                " headway.planning.prior.fit_prior, or set planner.adaptation to none."
+                " headway.planning.last_layer.prior.fit_prior, or set planner.adaptation to none."
             )
 
     @property

@@ -59,7 +59,7 @@ class Doubt(NamedTuple):
     """How uncertain the chosen heads' corrections are."""
 
     root: Layer
-    """Sᵀ as a layer: its squared output sums to the variance φᵀPφ of `adaptation`."""
+    """Sᵀ as a layer: its squared output sums to the variance φᵀPφ of `last_layer.regression`."""
     scale: Float[Array, "*env member obs"]
     """Standard deviation of the noise that it multiplies, in raw units."""
 

@@ -19,8 +19,8 @@ from headway.models.dynamics import Statistics
 from headway.models.fitting import EpochStats, FitData, FitSetup
 from headway.models.recurrent import RecurrentNet, RecurrentSetup, recurrent_epoch
 from headway.models.updates import Fitted
-from headway.planning.adaptive import AdaptiveModel, GradientAdapted, Recurrent
-from headway.planning.adaptive_agent import AdaptiveAgent, imagine
+from headway.planning.meta.agent import AdaptiveAgent, imagine
+from headway.planning.meta.models import AdaptiveModel, GradientAdapted, Recurrent
 
 
 class Adaptive(Learner):

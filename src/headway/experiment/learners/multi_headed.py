@@ -19,7 +19,7 @@ from headway.experiment.rollouts import Arena
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitSetup, FitState, episode_losses
 from headway.planning.agent import Agent
-from headway.planning.prior import fit_prior
+from headway.planning.last_layer.prior import fit_prior
 
 
 class MultiHeaded(Learner):

@@ -1,6 +1,6 @@
 """What heads should expect to learn in an episode: empirical Bayes on the training data.
 
-Every collected episode is a task of its own, in which the correction of `adaptation` is drawn
+Every collected episode is a task of its own, in which the correction of `regression` is drawn
 from the prior. Its residuals are then jointly Gaussian, for each dimension o
 
     r_o ~ N(0, σ_o² (N + ρ Φ Φᵀ)),
@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 
 from headway.data import Episodes, Trajectory
 from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.planning.adaptation import MAX_LOG_NOISE, Prior, Seen
+from headway.planning.last_layer.regression import MAX_LOG_NOISE, Prior, Seen
 from headway.tasks.base import Task
 
 RATIOS = np.geomspace(1e-7, 1e7, 281)

@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from headway.config import PlannerConfig
 from headway.models.compilation import jit_networks
 from headway.planning.acting import Physics
-from headway.planning.adaptive import AdaptiveModel, Transition
 from headway.planning.agent import Decision
 from headway.planning.heads import RecentTransitions
+from headway.planning.meta.models import AdaptiveModel, Transition
 from headway.planning.optimizers import SearchState, make_optimizer
 from headway.planning.returns import RolloutSettings, candidate_returns
 from headway.tasks.base import Task

@@ -6,7 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from headway.planning.adaptation import (
+from headway.planning.heads import RecentTransitions
+from headway.planning.imagination import PRECISIONS, Doubt, Layer
+from headway.planning.last_layer.regression import (
     LastLayer,
     Observed,
     Prior,
@@ -17,8 +19,6 @@ from headway.planning.adaptation import (
     log_likelihood,
     update,
 )
-from headway.planning.heads import RecentTransitions
-from headway.planning.imagination import PRECISIONS, Doubt, Layer
 from headway.planning.optimizers import where_env
 
 if TYPE_CHECKING:

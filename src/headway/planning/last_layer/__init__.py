@@ -1,0 +1,1 @@
+"""Heads that keep learning while they act: a Bayesian last layer for every episode."""
