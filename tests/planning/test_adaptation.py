@@ -315,10 +315,10 @@ def test_the_variance_in_the_plan_is_that_of_the_regression():
     x = jnp.asarray(rng.normal(size=(2, 4, 1, 5)), jnp.float32)
     hidden = np.asarray(agent.model.forward_net.head_input(x[:, :, 0].mT, None))
     for env in range(2):
-        one = folded.with_heads(jax.tree.map(lambda leaf, env=env: leaf[env], folded.heads))
+        one = folded.of_env(jax.tree.map(lambda leaf, env=env: leaf[env], folded.heads))
         noise = jnp.ones((2, 2, 1, 5))
         std = np.asarray(one.sample_delta(x, noise) - one.sample_delta(x, None))[:, :, 0]
-        plain = one.with_heads(one.heads._replace(doubt=None))
+        plain = one.of_env(one.heads._replace(doubt=None))
         own = np.asarray(plain.sample_delta(x, noise) - plain.sample_delta(x, None))[:, :, 0]
         for member, row in np.ndindex(2, 5):
             rest = [*np.asarray(context)[member, env], 1.0]

@@ -42,7 +42,7 @@ def test_a_folded_context_predicts_what_the_concatenated_one_predicts(place, cho
     heads = rng.integers(0, 2, (3, 2, 1)) if choices == 1 else np.tile([0, 1], (3, 2, 1))
     dynamics = ImaginedDynamics.fold(model, statistics, jnp.asarray(heads), context)
     for env in range(3):
-        one = dynamics.with_heads(jax.tree.map(lambda x, env=env: x[env], dynamics.heads))
+        one = dynamics.of_env(jax.tree.map(lambda x, env=env: x[env], dynamics.heads))
         x = jnp.concatenate([TASK.preprocess(obs[:, env]), action[:, env]], axis=-1)
         got = one.sample_delta(x.mT[..., None], noise[:, env].mT[..., None])[..., 0].mT
         inputs = network_input(TASK, statistics, obs[:, env], action[:, env])

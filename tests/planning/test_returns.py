@@ -217,7 +217,7 @@ def test_folded_model_equals_the_unfolded_one(which, with_context):
     x = jnp.concatenate([task.preprocess(obs), action], axis=-1)
     mean, sample = np.empty((2, 2, 3, 4, 2))
     for env in range(3):
-        one = dynamics.with_heads(jax.tree.map(lambda leaf, env=env: leaf[env], dynamics.heads))
+        one = dynamics.of_env(jax.tree.map(lambda leaf, env=env: leaf[env], dynamics.heads))
         wide = x[:, env].mT[..., None], noise[:, env].mT[..., None]  # one candidate
         mean[:, env] = one.sample_delta(wide[0], None)[..., 0].mT
         sample[:, env] = one.sample_delta(*wide)[..., 0].mT

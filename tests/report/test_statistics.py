@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from headway.errors import ConfigError
+from headway.experiment.references import normalised
 from headway.report.statistics import (
     Estimate,
     caution,
@@ -16,7 +17,6 @@ from headway.report.statistics import (
     interquartile_mean,
     interval,
     mean,
-    normalised,
     probability_of_improvement,
     standard_deviation,
     verdict,

@@ -17,6 +17,7 @@ from headway.planning.acting import Physics
 from headway.planning.agent import Agent, choose_heads, encode, planning_heads
 from headway.planning.heads import RecentTransitions
 from headway.planning.imagination import ImaginedDynamics
+from headway.planning.returns import follow
 
 NUM_STARTS = 256  # imagined rollouts per group in `prediction_error`
 
@@ -133,18 +134,4 @@ def _imagine(
     heads = choose_heads(agent, recent, context, error_key=error_key, head_key=head_key)
     folded = planning_heads(agent, heads)
     dynamics = ImaginedDynamics.fold(agent.model, agent.statistics, folded, context)
-    members = agent.model.num_members
-
-    def imagine_one(heads, now, actions) -> Float[Array, "horizon member obs"]:
-        one = dynamics.with_heads(heads)
-
-        def step(obs, action):
-            wide = jnp.broadcast_to(action[:, None, None], (members, action.size, 1, 1))
-            _, obs = one.step(agent.task, (), obs, wide, None)
-            return obs, obs[..., 0, 0]
-
-        start = jnp.broadcast_to(now[:, None, None], (members, now.size, 1, 1))
-        return jax.lax.scan(step, start, actions)[1]
-
-    now = recent.next_obs[:, -1]
-    return jax.vmap(imagine_one)(dynamics.heads, now, actions).transpose(2, 0, 1, 3)
+    return follow(dynamics, agent.task, recent.next_obs[:, -1], actions)

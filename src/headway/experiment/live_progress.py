@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Console, Group, RenderableType
-from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from headway.experiment.live_display import LiveDisplay
 from headway.experiment.progress import (
     Clock,
     Estimate,
@@ -23,7 +23,7 @@ from headway.experiment.progress import (
 BAR_WIDTH = 32
 
 
-class RichProgress(Progress):
+class RichProgress(LiveDisplay, Progress):
     """A few lines that are redrawn in place: where the run is, how fast, how good, how long.
 
     Args:
@@ -32,26 +32,11 @@ class RichProgress(Progress):
     """
 
     def __init__(self, console: Console | None = None, *, clock: Clock = time.monotonic):
-        self._console = console or Console(stderr=True)
+        super().__init__(console, refresh_per_second=4)
         self._estimate = Estimate(clock)
         self._iteration = self._num_iterations = self._total = 0
         self._name = ""
         self._values: dict[str, float] = {}
-        self._live = Live(
-            console=self._console,
-            get_renderable=self._render,
-            refresh_per_second=4,
-            redirect_stdout=False,
-            transient=True,
-        )
-
-    def __enter__(self):
-        self._live.start()
-        return self
-
-    def __exit__(self, kind, error, trace) -> None:
-        """Remove the display; what it said last stays in the log above."""
-        self._live.stop()
 
     def schedule(self, phases: Sequence[Phase]) -> None:
         """Take over the announced phases."""
@@ -74,10 +59,6 @@ class RichProgress(Progress):
         number = f"iteration {metrics['iteration'] + 1:>2}  "
         returns = "   ".join(summarise_returns(metrics))
         self._console.print(Text.assemble((number, "bold"), returns), highlight=False)
-
-    def message(self, text: str) -> None:
-        """Print a line above the display."""
-        self._console.print(text, markup=False, highlight=False)
 
     def _render(self) -> RenderableType:
         if not self._name:

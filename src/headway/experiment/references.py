@@ -9,6 +9,8 @@ with 16, 8 and 16 episodes (results/ceilings).
 
 from collections.abc import Mapping
 
+from headway.errors import ConfigError
+
 _PENDULUM = {  # length: (random, ceiling), 200 steps
     0.25: (-1748.0, -539.0),
     0.375: (-1622.0, -239.0),
@@ -61,4 +63,23 @@ def score(
     if length != full_length or sim_params.get(name) not in table or not others_nominal:
         return None
     random, ceiling = table[sim_params[name]]
+    return normalised(episode_return, random, ceiling)
+
+
+def normalised(episode_return: float, random: float, ceiling: float) -> float:
+    """Score of a return: 0 as random actions, 1 as the planner on the true dynamics.
+
+    Args:
+        episode_return: What is scored.
+        random: Mean return of random actions.
+        ceiling: Mean return of the planner on the true dynamics.
+
+    Raises:
+        ConfigError: Both references are the same, so that nothing lies between them.
+    """
+    if random == ceiling:
+        raise ConfigError(
+            f"random actions and true dynamics both return {random}, allowed: two references that"
+            " differ; report the return instead."
+        )
     return (episode_return - random) / (ceiling - random)

@@ -5,7 +5,7 @@ weights differ; candidates come last, so that every elementwise operation, slice
 features runs over long contiguous rows, and what all candidates share is a plain broadcast.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -82,7 +82,7 @@ class ImaginedDynamics(eqx.Module):
 
     hidden: tuple[Layer, ...]
     heads: ChosenHeads
-    """With a leading environment axis after `fold`, without one after `with_heads`."""
+    """With a leading environment axis after `fold`, without one after `of_env`."""
     delta_std: Float[Array, " obs"]
     context_layer: int | None = eqx.field(static=True, default=None)
     """The hidden layer that the context joins; None if it joins the heads."""
@@ -114,10 +114,7 @@ class ImaginedDynamics(eqx.Module):
         net = model.forward_net
         dtype = PRECISIONS[precision]
         (first, *others), shift = _hidden_without_context(net, context)
-        hidden = (
-            _layer(_fold_input(first, statistics), jnp.float32),
-            *(_layer(layer, dtype) for layer in others),
-        )
+        hidden = plan_layers((_fold_input(first, statistics), *others), precision)
         context_bias, place = None, net.context_layer
         if place is not None and shift is not None:
             context, context_bias = None, hidden[place].bias + shift
@@ -138,20 +135,18 @@ class ImaginedDynamics(eqx.Module):
         own = ChosenHeads(output, low, high, context_bias, doubt)
         return cls(hidden, own, delta.std, place)
 
-    def with_heads(self, heads: ChosenHeads) -> "ImaginedDynamics":
-        """The dynamics of one environment, whose heads have no environment axis."""
-        hidden = [*self.hidden]
-        if self.context_layer is not None and heads.context_bias is not None:
-            layer = hidden[self.context_layer]
-            hidden[self.context_layer] = layer._replace(bias=heads.context_bias)
-        return ImaginedDynamics(tuple(hidden), heads, self.delta_std, self.context_layer)
-
     @property
     def per_env(self) -> ChosenHeads:
         """See `Dynamics.per_env`."""
         return self.heads
 
-    of_env = with_heads
+    def of_env(self, part: ChosenHeads) -> "ImaginedDynamics":
+        """See `Dynamics.of_env`."""
+        hidden = [*self.hidden]
+        if self.context_layer is not None and part.context_bias is not None:
+            layer = hidden[self.context_layer]
+            hidden[self.context_layer] = layer._replace(bias=part.context_bias)
+        return ImaginedDynamics(tuple(hidden), part, self.delta_std, self.context_layer)
 
     @property
     def widest(self) -> int:
@@ -226,8 +221,18 @@ class ImaginedDynamics(eqx.Module):
         return jnp.sqrt(jnp.exp(bounded).sum(1)) * (scale / choices)
 
 
-def _layer(layer: Dense, dtype) -> Layer:
-    return Layer(layer.weight.mT.astype(dtype), layer.bias)
+def plan_layers(layers: Sequence[Dense], precision: str) -> tuple[Layer, ...]:
+    """Lay layers out for a plan; all but the first, which takes observations, in a precision.
+
+    Args:
+        layers: Of every member, perhaps of every environment.
+        precision: Of the products' inputs, `float32` or `bfloat16`.
+    """
+    dtypes = [jnp.float32, *[PRECISIONS[precision]] * (len(layers) - 1)]
+    return tuple(
+        Layer(layer.weight.mT.astype(dtype), layer.bias)
+        for layer, dtype in zip(layers, dtypes, strict=True)
+    )
 
 
 def _hidden_without_context(

@@ -135,6 +135,39 @@ def candidate_returns(
     return jax.lax.map(lambda one: of_one(*one), args, batch_size=batch_size)
 
 
+def follow(
+    dynamics: Dynamics,
+    task: Task,
+    obs: Float[Array, "env obs"],
+    actions: Float[Array, "env horizon action"],
+) -> Float[Array, "member env horizon obs"]:
+    """Where given actions lead, without noise; one rollout per member and environment.
+
+    Args:
+        dynamics: The model, as a plan would imagine with it.
+        task: How observations enter and leave the model.
+        obs: Where each environment is now.
+        actions: What is done, in [-1, 1].
+    """
+    members = dynamics.num_members
+
+    def alone(values: Float[Array, " size"]) -> Float[Array, "member size 1 1"]:
+        return jnp.broadcast_to(values[:, None, None], (members, values.size, 1, 1))
+
+    def of_one(part, obs, actions) -> Float[Array, "horizon member obs"]:
+        one = dynamics.of_env(part)
+
+        def step(carry, action):
+            memory, obs = carry
+            memory, obs = one.step(task, memory, obs, alone(action), None)
+            return (memory, obs), obs[..., 0, 0]
+
+        memory = jax.tree.map(lambda x: x[..., None, None], one.start())
+        return jax.lax.scan(step, (memory, alone(obs)), actions)[1]
+
+    return jax.vmap(of_one)(dynamics.per_env, obs, actions).transpose(2, 0, 1, 3)
+
+
 def _environment_returns(
     dynamics: Dynamics,
     task: Task,

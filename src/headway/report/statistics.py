@@ -173,25 +173,6 @@ def _share_of_wins(
     return 0.5 + 0.5 * sign.mean((-2, -1))
 
 
-def normalised(episode_return: float, random: float, ceiling: float) -> float:
-    """Score of a return: 0 as random actions, 1 as the planner on the true dynamics.
-
-    Args:
-        episode_return: What is scored.
-        random: Mean return of random actions.
-        ceiling: Mean return of the planner on the true dynamics.
-
-    Raises:
-        ConfigError: Both references are the same, so that nothing lies between them.
-    """
-    if random == ceiling:
-        raise ConfigError(
-            f"random actions and true dynamics both return {random}, allowed: two references that"
-            " differ; report the return instead."
-        )
-    return (episode_return - random) / (ceiling - random)
-
-
 def verdict(first: str, second: str, improvement: Estimate) -> str:
     """Word what a comparison shows; nothing is claimed from fewer than `MIN_RUNS` seeds.
 

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 from rich.console import Console, Group, RenderableType
-from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from headway.experiment.live_display import LiveDisplay
 from headway.experiment.progress import duration
 from headway.sweeps.board import Board, describe
 from headway.sweeps.jobs import Job
@@ -17,7 +17,7 @@ _ORDER = ("running", "lost", "busy", "failed", "waiting", "done")
 _OTHER_LINES = 5  # of the terminal, for headings and the prompt
 
 
-class LiveBoard(Board):
+class LiveBoard(LiveDisplay, Board):
     """Runs, iterations, returns and time left, redrawn in place; the busiest come first.
 
     Args:
@@ -25,33 +25,14 @@ class LiveBoard(Board):
     """
 
     def __init__(self, console: Console | None = None):
-        super().__init__()
-        self._console = console or Console(stderr=True)
-        self._live = Live(
-            console=self._console,
-            get_renderable=self._render,
-            refresh_per_second=2,
-            redirect_stdout=False,
-            transient=True,
-        )
-
-    def __enter__(self):
-        self._live.start()
-        return self
-
-    def __exit__(self, kind, error, trace) -> None:
-        """Remove the table; messages stay in the log above."""
-        self._live.stop()
+        LiveDisplay.__init__(self, console, refresh_per_second=2)
+        Board.__init__(self)
 
     def show(self, job: Job, before: Status, status: Status) -> None:
         """Say what ended above the table, where it stays."""
         if status.over:
             text = f"{describe(job)}: {status.state}  {status.note or status.returns}"
             self.message(text)
-
-    def message(self, text: str) -> None:
-        """Print a line above the table."""
-        self._console.print(text, markup=False, highlight=False)
 
     def _render(self) -> RenderableType:
         if not self.jobs:

@@ -15,7 +15,7 @@ from headway.planning.agent import Decision
 from headway.planning.heads import RecentTransitions
 from headway.planning.meta.models import AdaptiveModel, Transition
 from headway.planning.optimizers import SearchState, make_optimizer
-from headway.planning.returns import RolloutSettings, candidate_returns
+from headway.planning.returns import RolloutSettings, candidate_returns, follow
 from headway.tasks.base import Task
 
 
@@ -115,19 +115,4 @@ def imagine(
     by_slot = [jnp.moveaxis(x, 1, 0) for x in (recent.obs, recent.action, recent.next_obs)]
     memory, _ = jax.lax.scan(live, first, (jnp.arange(slots), *by_slot))
     dynamics = agent.model.dynamics(memory, "float32")
-
-    def imagine_one(part, now, actions) -> Float[Array, "horizon member obs"]:
-        one = dynamics.of_env(part)
-
-        def step(carry, action):
-            memory, obs = carry
-            wide = jnp.broadcast_to(action[:, None, None], (1, action.size, 1, 1))
-            memory, obs = one.step(agent.task, memory, obs, wide, None)
-            return (memory, obs), obs[..., 0, 0]
-
-        memory = jax.tree.map(lambda x: x[..., None, None], one.start())
-        start = jnp.broadcast_to(now[:, None, None], (1, now.size, 1, 1))
-        return jax.lax.scan(step, (memory, start), actions)[1]
-
-    now = recent.next_obs[:, -1]
-    return jax.vmap(imagine_one)(dynamics.per_env, now, actions).transpose(2, 0, 1, 3)
+    return follow(dynamics, agent.task, recent.next_obs[:, -1], actions)

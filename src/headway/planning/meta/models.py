@@ -12,10 +12,9 @@ from jaxtyping import Array, Bool, Float
 
 from headway.models.adapted import ReluNet, Window, adapt
 from headway.models.dynamics import Statistics, network_input
-from headway.models.networks import Dense
 from headway.models.recurrent import CellState, RecurrentNet, next_cell
 from headway.planning.heads import RecentTransitions
-from headway.planning.imagination import PRECISIONS, Layer, over_rows
+from headway.planning.imagination import Layer, over_rows, plan_layers
 from headway.planning.optimizers import where_env
 from headway.planning.returns import Dynamics
 from headway.tasks.base import Task
@@ -80,10 +79,8 @@ class GradientAdapted(eqx.Module):
     def dynamics(self, memory: RecentTransitions, precision: str) -> "AdaptedDynamics":
         """See `AdaptiveModel.dynamics`."""
         net = self.adapted(memory)
-        dtype = PRECISIONS[precision]
-        first, *others = (*net.hidden, net.output)
-        layers = [_layer(first, jnp.float32), *(_layer(layer, dtype) for layer in others)]
-        return AdaptedDynamics(tuple(layers), self.statistics)
+        layers = plan_layers((*net.hidden, net.output), precision)
+        return AdaptedDynamics(layers, self.statistics)
 
 
 class AdaptedDynamics(eqx.Module):
@@ -149,10 +146,8 @@ class Recurrent(eqx.Module):
 
     def dynamics(self, memory: tuple[CellState, ...], precision: str) -> "RecurrentDynamics":
         """See `AdaptiveModel.dynamics`."""
-        dtype = PRECISIONS[precision]
-        first, *others = (*self.net.layers, self.net.output)
-        layers = [_layer(first, jnp.float32), *(_layer(layer, dtype) for layer in others)]
-        return RecurrentDynamics(tuple(layers), memory, self.statistics)
+        layers = plan_layers((*self.net.layers, self.net.output), precision)
+        return RecurrentDynamics(layers, memory, self.statistics)
 
 
 class RecurrentDynamics(eqx.Module):
@@ -225,8 +220,3 @@ def next_observation(
     """Where a predicted, normalised `delta` leads."""
     delta = over_rows(statistics.delta.denormalize)(normalized)
     return over_rows(task.postprocess)(obs, delta)
-
-
-def _layer(layer: Dense, dtype: Any) -> Layer:
-    """A layer with its outputs first, perhaps of every environment."""
-    return Layer(layer.weight.mT.astype(dtype), layer.bias)

@@ -5,10 +5,9 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from headway.experiment.references import score
+from headway.experiment.references import normalised, score
 from headway.experiment.tables import EpisodeRow, format_sim_params
 from headway.report.page.runs import LoadedRun
-from headway.report.statistics import normalised
 
 RANDOM = "random"
 CEILING = "true-dynamics"
