@@ -24,9 +24,9 @@ import numpy as np
 from headway.config import FittingConfig, ModelConfig
 from headway.data import Trajectory
 from headway.experiment.blocks import BlockedData, Layout, fit_blocks
-from headway.experiment.storage import load_trajectories, save_trajectories
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitSetup
+from headway.storage.records import load_trajectories, save_trajectories
 from headway.tasks.catalog import env_spec
 
 EPISODE_LENGTH = 1000

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from headway.experiment.references import score
-from headway.experiment.storage import read_csv
-from headway.experiment.tables import EVALUATION_COLUMNS, EpisodeRow, format_sim_params
+from headway.storage.records import read_csv
+from headway.storage.tables import EVALUATION_COLUMNS, EpisodeRow, format_sim_params
 
 
 def last_rows(run_dir: Path) -> list[EpisodeRow]:

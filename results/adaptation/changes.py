@@ -22,8 +22,8 @@ from jaxtyping import Float
 from headway.experiment.loading import load_agent
 from headway.experiment.methods import config_to_evaluate
 from headway.experiment.rollouts import AgentPolicy, Arena, Episode, run_episodes
-from headway.experiment.runs import RunDir
-from headway.experiment.storage import read_csv, write_csv
+from headway.storage.records import read_csv, write_csv
+from headway.storage.run_dir import RunDir
 
 COLUMNS = (
     "run", "env", "seed", "arm", "settings", "step", "before", "after",

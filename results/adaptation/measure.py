@@ -14,9 +14,9 @@ from typing import Any
 
 import headway
 from headway.experiment.progress import make_progress
-from headway.experiment.runs import RunDir
-from headway.experiment.storage import read_csv, write_csv
 from headway.report.tables import by_physics
+from headway.storage.records import read_csv, write_csv
+from headway.storage.run_dir import RunDir
 
 COLUMNS = (
     "run", "env", "method", "seed", "arm", "group", "sim_params", "settings", "episodes",

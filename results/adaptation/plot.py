@@ -12,9 +12,9 @@ import numpy as np
 from matplotlib.lines import Line2D
 from measure import COLUMNS
 
-from headway.experiment.storage import read_csv
 from headway.report import style
 from headway.report.physics import axis_label, value_label, varying
+from headway.storage.records import read_csv
 
 SHIFT = 0.13  # between arms, in units of the distance between physics
 Scores = dict[str, dict[tuple[str, str], list[float]]]

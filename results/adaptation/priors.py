@@ -9,7 +9,7 @@ import numpy as np
 
 from headway.experiment.loading import load_agent
 from headway.experiment.methods import config_to_evaluate
-from headway.experiment.runs import RunDir
+from headway.storage.run_dir import RunDir
 
 
 def main(run_dirs: list[str]) -> None:

@@ -20,9 +20,9 @@ import headway
 from headway.config import Config, PlannerConfig
 from headway.experiment.methods import config_to_evaluate
 from headway.experiment.progress import make_progress
-from headway.experiment.runs import RunDir
-from headway.experiment.storage import read_csv, write_csv
 from headway.report.tables import by_physics
+from headway.storage.records import read_csv, write_csv
+from headway.storage.run_dir import RunDir
 
 COLUMNS = (
     "run", "env", "planner", "physics", "settings", "episodes", "score", "return_mean",

@@ -14,8 +14,8 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from measure import COLUMNS
 
-from headway.experiment.storage import read_csv
 from headway.report import style
+from headway.storage.records import read_csv
 
 FAMILIES = {"cem": "o", "icem": "^", "mppi": "s", "random-shooting": "D"}
 COLORS = dict(zip(FAMILIES, (style.TRAINING, *style.UNSEEN), strict=False))

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from headway.experiment.methods import METHODS as METHODS
     from headway.experiment.methods import PRESETS as PRESETS
     from headway.experiment.methods import make_config as make_config
-    from headway.experiment.runs import RunDir as RunDir
-    from headway.experiment.tables import EpisodeRow as EpisodeRow
     from headway.models.dynamics import MultiHeadDynamics as MultiHeadDynamics
     from headway.planning.agent import Agent as Agent
     from headway.planning.controller import Controller as Controller
@@ -43,6 +41,8 @@ if TYPE_CHECKING:
     from headway.report.dynamics import plot_dynamics as plot_dynamics
     from headway.report.page.build import write_report as write_report
     from headway.sim_params import SimParamSets as SimParamSets
+    from headway.storage.run_dir import RunDir as RunDir
+    from headway.storage.tables import EpisodeRow as EpisodeRow
     from headway.tasks.base import Task as Task
     from headway.tasks.catalog import EnvSpec as EnvSpec
     from headway.tasks.catalog import env_spec as env_spec
@@ -64,8 +64,6 @@ _HOME = {
         "UnknownNameError",
     ),
     "experiment.methods": ("METHODS", "PRESETS", "make_config"),
-    "experiment.runs": ("RunDir",),
-    "experiment.tables": ("EpisodeRow",),
     "models.dynamics": ("MultiHeadDynamics",),
     "planning.agent": ("Agent",),
     "planning.controller": ("Controller",),
@@ -74,6 +72,8 @@ _HOME = {
     "report.dynamics": ("plot_dynamics",),
     "report.page.build": ("write_report",),
     "sim_params": ("SimParamSets",),
+    "storage.run_dir": ("RunDir",),
+    "storage.tables": ("EpisodeRow",),
     "tasks.base": ("Task",),
     "tasks.catalog": ("EnvSpec", "env_spec", "register"),
 }

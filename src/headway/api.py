@@ -10,12 +10,12 @@ from headway.experiment.evaluation import PlanningCost, episode_rows
 from headway.experiment.loading import load_agent
 from headway.experiment.methods import make_config
 from headway.experiment.progress import Progress
-from headway.experiment.runs import RunDir
-from headway.experiment.tables import EpisodeRow
 from headway.experiment.testing import run_tests
 from headway.experiment.training import train_run
 from headway.planning.controller import Controller
 from headway.report.figures import save_run_figures
+from headway.storage.run_dir import RunDir
+from headway.storage.tables import EpisodeRow
 
 
 @dataclasses.dataclass(frozen=True)

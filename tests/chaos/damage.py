@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from headway.experiment import files
+from headway.storage import files
 
 NEWEST = "manifests/iteration-001.json"
 

@@ -5,10 +5,11 @@ import os
 from pathlib import Path
 
 from headway.config import Config
-from headway.experiment import files, progress_store, training
+from headway.experiment import training
 from headway.experiment.methods import make_config
 from headway.experiment.progress import Progress
-from headway.experiment.runs import RunDir
+from headway.storage import files, progress_store
+from headway.storage.run_dir import RunDir
 
 TINY = {
     "collection.episode_length": 6,
@@ -44,7 +45,7 @@ class Trigger:
 
 
 class KillingOS:
-    """The module `os`, as `headway.experiment.files` sees it, with a trigger around all writes."""
+    """The module `os`, as `headway.storage.files` sees it, with a trigger around all writes."""
 
     def __init__(self, trigger: Trigger):
         self._trigger = trigger

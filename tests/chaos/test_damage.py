@@ -14,9 +14,10 @@ import pytest
 from headway import settings
 from headway.config import Config
 from headway.errors import ConfigError, HeadwayError, RunError
-from headway.experiment import arrays, loading, storage, training
-from headway.experiment.runs import RunDir
-from headway.experiment.tables import EVALUATION_COLUMNS
+from headway.experiment import loading, training
+from headway.storage import arrays, records
+from headway.storage.run_dir import RunDir
+from headway.storage.tables import EVALUATION_COLUMNS
 
 DATA = Path(__file__).parent.parent / "data"
 SECONDS, BYTES = 5.0, 2**30
@@ -218,15 +219,15 @@ def test_a_field_of_a_hundred_megabytes(quote, tmp_path):
     path = tmp_path / "evaluation.csv"
     header = ",".join(EVALUATION_COLUMNS) + "\n"
     path.write_text(header + quote + "x" * 10**8)
-    assert "allowed: at most" in refused(storage.read_csv, path, EVALUATION_COLUMNS)
+    assert "allowed: at most" in refused(records.read_csv, path, EVALUATION_COLUMNS)
     path.write_text(header + quote + "x" * 10**7)
-    assert "field larger than" in refused(storage.read_csv, path, EVALUATION_COLUMNS)
+    assert "field larger than" in refused(records.read_csv, path, EVALUATION_COLUMNS)
 
 
 def test_millions_of_rows(tmp_path):
     path = tmp_path / "evaluation.csv"
     path.write_text(",".join(EVALUATION_COLUMNS) + "\n" + "m,e,0,0,g,,0,0,0\n" * 2_000_000)
-    assert "more than 500,000 rows" in refused(storage.read_csv, path, EVALUATION_COLUMNS)
+    assert "more than 500,000 rows" in refused(records.read_csv, path, EVALUATION_COLUMNS)
 
 
 @pytest.mark.parametrize("name", ["../outside.txt", "/etc/passwd", "data/../../x", "a\\..\\b", "."])

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from headway import settings as config_settings
 from headway.config import Config
 from headway.errors import ConfigError, RunError
-from headway.experiment import arrays, files, storage
-from headway.experiment.tables import EVALUATION_COLUMNS, EpisodeRow, check_metrics, parse_rows
+from headway.storage import arrays, files, records
+from headway.storage.tables import EVALUATION_COLUMNS, EpisodeRow, check_metrics, parse_rows
 
 MANY = settings(max_examples=200)
 JSON = st.recursive(
@@ -69,7 +69,7 @@ def test_any_json(content):
 def test_any_table_of_test_episodes(rows, header):
     lines = [",".join(EVALUATION_COLUMNS)] * header + [",".join(row) for row in rows]
     content = "\n".join(lines).encode("utf-8", "replace")
-    table = storage.parse_csv(PATH, content, EVALUATION_COLUMNS)
+    table = records.parse_csv(PATH, content, EVALUATION_COLUMNS)
     found = taken(RunError, parse_rows, PATH, table, EpisodeRow.from_csv)
     assert all(math.isfinite(row.episode_return) for row in found or ())
 
@@ -77,7 +77,7 @@ def test_any_table_of_test_episodes(rows, header):
 @MANY
 @given(content=st.binary(max_size=300))
 def test_any_bytes_as_a_table(content):
-    taken(RunError, list, storage.parse_csv(PATH, content, EVALUATION_COLUMNS))
+    taken(RunError, list, records.parse_csv(PATH, content, EVALUATION_COLUMNS))
 
 
 @MANY

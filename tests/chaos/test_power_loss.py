@@ -6,7 +6,8 @@ import pytest
 from killing import ALWAYS, NEVER, Killed, KillingProgress, Trigger
 from power_loss import ForgetfulOS
 
-from headway.experiment import files, progress_store, training
+from headway.experiment import training
+from headway.storage import files, progress_store
 
 
 def train_on_a_forgetful_disk(path, left, place, every, rng, monkeypatch):

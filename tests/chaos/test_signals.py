@@ -12,10 +12,11 @@ import pytest
 from killing import ALWAYS, NEVER
 
 from headway.errors import BadEnvironmentError
-from headway.experiment import progress_store, resumable, training
-from headway.experiment.interrupts import Terminated
+from headway.experiment import resumable, training
 from headway.experiment.learners import multi_headed
 from headway.experiment.progress import Progress
+from headway.storage import progress_store
+from headway.storage.interrupts import Terminated
 
 
 class Signalling(Progress):
@@ -231,7 +232,8 @@ def test_an_error_is_not_hidden_by_a_request_to_stop(tmp_path):
 SCRIPT = """
 import sys
 import killing
-from headway.experiment import progress_store, training
+from headway.experiment import training
+from headway.storage import progress_store
 progress_store.EVERY = float(sys.argv[2])
 training.train_run(killing.tiny_config(), sys.argv[1])
 """

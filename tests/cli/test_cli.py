@@ -10,11 +10,11 @@ from headway.cli import main
 from headway.cli.commands import parse_train
 from headway.errors import RunError
 from headway.experiment.evaluation import PlanningCost
-from headway.experiment.interrupts import Terminated
 from headway.experiment.methods import METHODS, PRESETS, make_config
-from headway.experiment.runs import RunDir
-from headway.experiment.tables import EpisodeRow
 from headway.settings import override
+from headway.storage.interrupts import Terminated
+from headway.storage.run_dir import RunDir
+from headway.storage.tables import EpisodeRow
 
 
 def run(capsys, *words):

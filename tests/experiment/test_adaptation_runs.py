@@ -9,10 +9,10 @@ import pytest
 
 import headway
 from headway.experiment import loading
-from headway.experiment.arrays import tree_arrays, tree_from_arrays
 from headway.experiment.methods import config_to_evaluate, make_config
 from headway.experiment.rollouts import Arena, Episode, random_policy, run_episodes
-from headway.experiment.runs import RunDir
+from headway.storage.arrays import tree_arrays, tree_from_arrays
+from headway.storage.run_dir import RunDir
 
 OLD_RUN = Path(__file__).parents[1] / "data" / "run-schema-1"
 LAST_LAYER = {"planner.adaptation": "last-layer"}

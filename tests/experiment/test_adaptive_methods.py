@@ -61,7 +61,7 @@ def test_a_fit_that_is_cut_between_epochs_goes_on(method, tmp_path, monkeypatch)
         return check(*args)
 
     with monkeypatch.context() as patch:
-        patch.setattr("headway.experiment.progress_store.EVERY", 0)
+        patch.setattr("headway.storage.progress_store.EVERY", 0)
         patch.setattr(training, "divergence", interrupted)
         with pytest.raises(KeyboardInterrupt):
             training.train_run(config, tmp_path / "cut")

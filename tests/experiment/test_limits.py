@@ -10,7 +10,7 @@ from headway import api
 from headway.errors import LimitError
 from headway.experiment import limits, loading, training
 from headway.experiment.methods import make_config
-from headway.experiment.runs import RunDir
+from headway.storage.run_dir import RunDir
 
 GIB = 2**30
 

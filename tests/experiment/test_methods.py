@@ -6,7 +6,7 @@ from headway.errors import ConfigError, UnknownNameError
 from headway.experiment.evaluation import group_episodes
 from headway.experiment.methods import METHODS, PRESETS, make_config
 from headway.experiment.references import score
-from headway.experiment.tables import format_sim_params, parse_sim_params
+from headway.storage.tables import format_sim_params, parse_sim_params
 from headway.tasks.catalog import env_names, env_spec
 
 

@@ -9,11 +9,12 @@ import pytest
 
 import headway
 from headway.errors import ConfigError, PlanningError, RunError
-from headway.experiment import arrays, loading, training
-from headway.experiment.interrupts import StopRequest
+from headway.experiment import loading, training
 from headway.experiment.methods import make_config
 from headway.experiment.progress import Progress
-from headway.experiment.runs import RunDir
+from headway.storage import arrays
+from headway.storage.interrupts import StopRequest
+from headway.storage.run_dir import RunDir
 from headway.tasks.catalog import env_names
 
 TINY = {"collection.episode_length": 12, "fitting.epochs": 1}

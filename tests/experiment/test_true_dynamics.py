@@ -157,7 +157,7 @@ def test_an_interrupted_test_on_the_simulator_goes_on_to_the_same_end(tmp_path, 
         return act(self, obs)
 
     with monkeypatch.context() as patch:
-        patch.setattr("headway.experiment.progress_store.EVERY", 0)
+        patch.setattr("headway.storage.progress_store.EVERY", 0)
         patch.setattr(training.AgentPolicy, "__call__", interrupted)
         with pytest.raises(KeyboardInterrupt):
             training.train_run(config, tmp_path / "cut")

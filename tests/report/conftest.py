@@ -7,8 +7,8 @@ import pytest
 
 from headway import settings
 from headway.config import CollectionConfig, Config
-from headway.experiment.runs import RunDir
-from headway.experiment.tables import EpisodeRow
+from headway.storage.run_dir import RunDir
+from headway.storage.tables import EpisodeRow
 
 TRAIN = (0.5, 0.75, 1.0, 1.25)
 GROUPS = {"train": TRAIN, "low": (0.25, 0.375), "high": (1.5, 1.75)}

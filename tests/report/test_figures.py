@@ -6,12 +6,12 @@ import pytest
 from PIL import Image
 
 from headway.errors import RunError
-from headway.experiment.tables import EpisodeRow
 from headway.report.dynamics import Changes, choose_views, collect_changes
 from headway.report.figures import save_run_figures
 from headway.report.obs_names import obs_names
 from headway.report.physics import axis_label, distinct, full_label, varying
 from headway.report.tables import by_group, by_physics, envs
+from headway.storage.tables import EpisodeRow
 from headway.tasks.catalog import env_spec
 
 ALL = ["learning_curve.png", "evaluation.png", "head_shares.png", "prediction_error.png"]

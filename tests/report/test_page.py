@@ -14,12 +14,12 @@ import pytest
 import headway
 from headway.cli import main
 from headway.errors import ConfigError, RunError, UnknownNameError
-from headway.experiment.runs import RunDir
 from headway.report.page.build import SECTIONS, write_report
 from headway.report.page.contexts import principal_components, variance_between
 from headway.report.page.runs import load_runs, train_command
 from headway.report.page.series import Comparison, series_labels
 from headway.report.page.svg import THEME
+from headway.storage.run_dir import RunDir
 
 SAMPLE = Path(__file__).parent.parent / "data" / "run-schema-2"  # two of three iterations
 HOSTILE = '<script>alert("1")</script>&amp;$x_{2}$'

@@ -7,8 +7,8 @@ import numpy as np
 from headway import settings
 from headway.errors import BusyError, DivergenceError
 from headway.experiment.methods import make_config
-from headway.experiment.runs import RunDir
-from headway.experiment.tables import EpisodeRow
+from headway.storage.run_dir import RunDir
+from headway.storage.tables import EpisodeRow
 from headway.sweeps.board import Board
 from headway.sweeps.jobs import Job
 from headway.tasks.catalog import env_spec

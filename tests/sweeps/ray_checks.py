@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from headway.experiment.run_lock import LOCK
-from headway.experiment.runs import RunDir
 from headway.experiment.training import train_run
+from headway.storage.run_dir import RunDir
+from headway.storage.run_lock import LOCK
 
 
 def holder(path: Path) -> int:

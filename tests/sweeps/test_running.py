@@ -8,8 +8,8 @@ from rich.console import Console
 
 from headway.errors import ConfigError
 from headway.experiment.loading import load_task
-from headway.experiment.run_lock import locked
 from headway.planning.flop import plan_flop
+from headway.storage.run_lock import locked
 from headway.sweeps import running
 from headway.sweeps.board import PlainBoard
 from headway.sweeps.cost import make_plan, run_flop

@@ -26,7 +26,7 @@ from headway.errors import ConfigError, unknown_name
 
 if TYPE_CHECKING:
     from headway.experiment.evaluation import PlanningCost
-    from headway.experiment.tables import EpisodeRow
+    from headway.storage.tables import EpisodeRow
     from headway.tasks.catalog import EnvSpec
 
 MAX_SIM_PARAMS_BYTES = 2**20
@@ -173,7 +173,7 @@ def parse_evaluate(words: Sequence[str]) -> tuple[Evaluate, dict[str, Any]]:
     """
 
     def trained(first: Evaluate) -> Config:
-        from headway.experiment.runs import RunDir
+        from headway.storage.run_dir import RunDir
 
         return RunDir(first.run).config()
 
@@ -231,7 +231,7 @@ def _env_options(env: str, words: Sequence[str]) -> dict[str, bool]:
 
 def _read_sim_params(path: Path) -> dict[str, Any]:
     """Read a file of training and unseen physics; the library checks what it holds."""
-    from headway.experiment import files
+    from headway.storage import files
 
     try:
         return files.parse_json(files.read_bytes(path, MAX_SIM_PARAMS_BYTES))

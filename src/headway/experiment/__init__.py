@@ -1,1 +1,1 @@
-"""How it is measured: methods, rollouts, evaluation, run directories, training."""
+"""How it is measured: methods, rollouts, learners, evaluation, training."""

@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.data import Episodes, Trajectory, sim_params_row
-from headway.experiment.tables import format_sim_params
 from headway.models.fitting import FitSetup, assign_segments
 from headway.planning.acting import Physics
 from headway.planning.agent import Agent, choose_heads, encode, planning_heads
 from headway.planning.heads import RecentTransitions
 from headway.planning.imagination import ImaginedDynamics
 from headway.planning.returns import follow
+from headway.storage.tables import format_sim_params
 
 NUM_STARTS = 256  # imagined rollouts per group in `prediction_error`
 

@@ -9,7 +9,6 @@ from jaxtyping import PRNGKeyArray
 
 from headway.config import Config
 from headway.data import Trajectory
-from headway.experiment.progress_store import ProgressStore
 from headway.experiment.resumable import resumable_episodes
 from headway.experiment.rollouts import (
     AgentPolicy,
@@ -19,10 +18,11 @@ from headway.experiment.rollouts import (
     accept,
     run_episodes,
 )
-from headway.experiment.tables import EpisodeRow
 from headway.planning.acting import Acting
 from headway.planning.flop import plan_flop
 from headway.sim_params import SimParamSets
+from headway.storage.progress_store import ProgressStore
+from headway.storage.tables import EpisodeRow
 from headway.tasks.base import Task
 
 GROUP_SEEDS = 1000  # seeds reserved for each group, so that groups never share an episode

@@ -5,13 +5,13 @@ import jax
 
 from headway.config import Config
 from headway.errors import RunError
-from headway.experiment import arrays
 from headway.experiment.learners import Learned, Learner, make_learner
 from headway.experiment.limits import MemoryNeed, check_memory, memory_need
 from headway.experiment.methods import check_options
 from headway.experiment.rollouts import Arena
-from headway.experiment.runs import RunDir
 from headway.planning.acting import Acting
+from headway.storage import arrays
+from headway.storage.run_dir import RunDir
 from headway.tasks.base import Task
 from headway.tasks.catalog import env_spec
 

@@ -14,10 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from headway.errors import RunError
-from headway.experiment.arrays import tree_arrays, tree_from_arrays
-from headway.experiment.files import damaged
 from headway.experiment.progress import Progress
-from headway.experiment.progress_store import Part, ProgressStore
 from headway.experiment.rollouts import (
     AgentPolicy,
     Arena,
@@ -28,8 +25,11 @@ from headway.experiment.rollouts import (
     Rollout,
     run_episodes,
 )
-from headway.experiment.storage import trajectories_from, trajectory_arrays, trajectory_facts
 from headway.models.fitting import EpochStats, FitState
+from headway.storage.arrays import tree_arrays, tree_from_arrays
+from headway.storage.files import damaged
+from headway.storage.progress_store import Part, ProgressStore
+from headway.storage.records import trajectories_from, trajectory_arrays, trajectory_facts
 
 _KEPT = ("action", "failures", "evaluations")  # of every choice
 

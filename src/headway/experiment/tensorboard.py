@@ -4,8 +4,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from headway.experiment import files
-from headway.experiment.manifest import inside
+from headway.storage import files
+from headway.storage.manifest import inside
 
 
 def write_tensorboard(run_dir: Path, metrics: dict[str, Any]) -> None:

@@ -16,8 +16,8 @@ from headway.experiment.loading import load_agent, need_of
 from headway.experiment.methods import config_to_evaluate
 from headway.experiment.progress import Progress
 from headway.experiment.rollouts import Arena, PlannerUse
-from headway.experiment.runs import RunDir
 from headway.planning.acting import Acting
+from headway.storage.run_dir import RunDir
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,16 +13,13 @@ from jaxtyping import PRNGKeyArray
 from headway.config import Config
 from headway.data import ReplayBuffer, Trajectory
 from headway.errors import BadEnvironmentError, DivergenceError
-from headway.experiment import arrays
 from headway.experiment.divergence import SLOWER, diverged, divergence, first_non_finite
 from headway.experiment.evaluation import episode_rows, evaluate_agent
-from headway.experiment.interrupts import StopRequest, stop_requests
 from headway.experiment.learners import Fit, Learned, Learner, make_learner
 from headway.experiment.limits import check_memory
 from headway.experiment.loading import initial, load_learned, need_of
 from headway.experiment.methods import check_block
 from headway.experiment.progress import Progress
-from headway.experiment.progress_store import ProgressStore
 from headway.experiment.resumable import (
     fit_part,
     fitted_before,
@@ -39,10 +36,13 @@ from headway.experiment.rollouts import (
     accept,
     random_policy,
 )
-from headway.experiment.runs import RunDir
 from headway.experiment.tensorboard import write_tensorboard
 from headway.models.fitting import EpochStats
 from headway.planning.acting import Acting
+from headway.storage import arrays
+from headway.storage.interrupts import StopRequest, stop_requests
+from headway.storage.progress_store import ProgressStore
+from headway.storage.run_dir import RunDir
 
 
 class Keys(NamedTuple):

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from headway.experiment import files, storage
-from headway.experiment.runs import RunDir
 from headway.report.comparison_runs import COLLECTED, Found
 from headway.report.comparison_statistics import interquartile, verdicts
 from headway.report.statistics import MIN_RUNS
 from headway.report.tables import by_group
+from headway.storage import files, records
+from headway.storage.run_dir import RunDir
 
 RAW_COLUMNS = (
     "experiment", "arm", "env", "method", "preset", "seed", "iteration", "timesteps", "group",
@@ -22,7 +22,7 @@ IQM = "interquartile mean (95 %)"
 def write_raw(found: Found) -> Path:
     """Write every episode's return."""
     path = found.comparison.folder / f"{found.comparison.experiment.name}.csv"
-    storage.write_csv(path, RAW_COLUMNS, found.rows)
+    records.write_csv(path, RAW_COLUMNS, found.rows)
     return path
 
 

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from headway.experiment.runs import RunDir
-from headway.experiment.tables import format_sim_params
+from headway.storage.run_dir import RunDir
+from headway.storage.tables import format_sim_params
 from headway.sweeps.board import first_status
 from headway.sweeps.jobs import Cell, Comparison, Job
 

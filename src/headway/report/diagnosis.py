@@ -13,7 +13,6 @@ from headway.data import Trajectory
 from headway.errors import ConfigError
 from headway.experiment.loading import load_agent
 from headway.experiment.progress import Progress
-from headway.experiment.runs import RunDir
 from headway.experiment.selection import (
     LEVELS,
     EpisodeSelection,
@@ -25,6 +24,7 @@ from headway.experiment.testing import run_tests
 from headway.planning.agent import Agent
 from headway.report.physics import distinct, full_label, varying
 from headway.report.tables import new_table
+from headway.storage.run_dir import RunDir
 
 Facts = dict[str, Any]
 

@@ -11,8 +11,6 @@ from matplotlib.ticker import MaxNLocator
 
 from headway.config import Config
 from headway.experiment.references import score
-from headway.experiment.runs import RunDir
-from headway.experiment.tables import EpisodeRow, parse_sim_params
 from headway.report.physics import axis_label, distinct, value_label, varying
 from headway.report.style import (
     FAINT,
@@ -25,6 +23,8 @@ from headway.report.style import (
     label_axis,
     legend,
 )
+from headway.storage.run_dir import RunDir
+from headway.storage.tables import EpisodeRow, parse_sim_params
 
 Row = dict[str, Any]
 

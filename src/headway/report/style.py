@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from headway.experiment import files
+from headway.storage import files
 
 INK = "#222222"
 FAINT = "#7a7a7a"

@@ -9,8 +9,8 @@ from rich.table import Table
 
 from headway.experiment.methods import METHODS, PRESETS
 from headway.experiment.references import score
-from headway.experiment.tables import EpisodeRow
 from headway.report.physics import axis_label, distinct, full_label, value_label, varying
+from headway.storage.tables import EpisodeRow
 from headway.tasks.catalog import EnvSpec, env_names, env_spec
 
 Facts = dict[str, Any]

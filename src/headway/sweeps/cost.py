@@ -9,8 +9,8 @@ import numpy as np
 from headway.config import Config
 from headway.experiment.limits import num_parameters
 from headway.experiment.loading import load_task
-from headway.experiment.runs import RunDir
 from headway.planning.flop import plan_flop
+from headway.storage.run_dir import RunDir
 from headway.sweeps.board import first_status
 from headway.sweeps.jobs import Job
 from headway.sweeps.status import State

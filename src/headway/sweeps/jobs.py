@@ -15,7 +15,7 @@ from headway import settings
 from headway.config import Config
 from headway.errors import ConfigError, RunError
 from headway.experiment.methods import make_config
-from headway.experiment.runs import RunDir
+from headway.storage.run_dir import RunDir
 from headway.sweeps.experiments import Arm, Experiment, Settings
 from headway.tasks.catalog import env_spec
 

@@ -13,13 +13,13 @@ from markupsafe import Markup
 
 import headway
 from headway.errors import ConfigError, unknown_name
-from headway.experiment import files
 from headway.report.page import facts, insides, sections
 from headway.report.page.parts import Section
 from headway.report.page.runs import load_runs
 from headway.report.page.series import Comparison
 from headway.report.page.svg import THEME
 from headway.report.page.symbols import same_symbol, symbol
+from headway.storage import files
 
 SECTIONS: dict[str, Callable[[Comparison], Section]] = {
     "results": sections.results,

@@ -11,7 +11,6 @@ from matplotlib.colors import to_rgba
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from headway.experiment.tables import parse_sim_params
 from headway.report import statistics
 from headway.report.page.measures import Curve
 from headway.report.page.runs import Row
@@ -19,6 +18,7 @@ from headway.report.page.series import Series
 from headway.report.page.svg import DASHES, MARKERS, ORDERED, SWATCHES
 from headway.report.physics import axis_label, distinct, value_label, varying
 from headway.report.style import FAINT, INK, RULE, group_label, label_axis
+from headway.storage.tables import parse_sim_params
 
 Marks = Mapping[str, float]
 

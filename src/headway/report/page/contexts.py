@@ -8,10 +8,10 @@ from jaxtyping import Float
 
 from headway.data import Trajectory
 from headway.experiment.loading import load_agent
-from headway.experiment.runs import RunDir
 from headway.planning.agent import Agent, encode
 from headway.planning.heads import RecentTransitions
 from headway.report.page.runs import LoadedRun
+from headway.storage.run_dir import RunDir
 
 NUM_MOMENTS = 320  # of the collected episodes, evenly spread
 

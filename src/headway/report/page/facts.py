@@ -4,7 +4,6 @@ import shlex
 
 import numpy as np
 
-from headway.experiment.storage import csv_lines
 from headway.report.page import charts, svg
 from headway.report.page.measures import RAW_COLUMNS, raw_rows
 from headway.report.page.parts import Block, Cell, Line, Panel, Section, Table, identifier
@@ -15,6 +14,7 @@ from headway.report.page.series import (
     run_settings,
     value_text,
 )
+from headway.storage.records import csv_lines
 
 PHASES = ("collect", "fit", "evaluate")
 _TEXTS = ("env", "method", "group", "sim_params")

@@ -8,10 +8,10 @@ from typing import Any, TypeVar
 from headway import settings
 from headway.config import Config
 from headway.errors import HeadwayError, RunError
-from headway.experiment import config_file
 from headway.experiment.methods import make_config
-from headway.experiment.runs import RunDir
-from headway.experiment.tables import EpisodeRow
+from headway.storage import config_file
+from headway.storage.run_dir import RunDir
+from headway.storage.tables import EpisodeRow
 
 Row = dict[str, Any]
 Content = TypeVar("Content")

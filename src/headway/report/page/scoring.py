@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from headway.experiment.references import normalised, score
-from headway.experiment.tables import EpisodeRow, format_sim_params
 from headway.report.page.runs import LoadedRun
+from headway.storage.tables import EpisodeRow, format_sim_params
 
 RANDOM = "random"
 CEILING = "true-dynamics"

@@ -9,8 +9,8 @@ import safetensors.numpy
 
 import toys
 from headway.errors import RunError
-from headway.experiment import files, storage
-from headway.experiment.mapped import map_arrays
+from headway.storage import files, records
+from headway.storage.mapped import map_arrays
 
 
 def mapping_of(array):
@@ -82,8 +82,8 @@ def test_a_missing_file_is_named(tmp_path):
 def test_trajectories_come_back_as_they_were_but_stay_in_their_file(tmp_path):
     toy = [toys.random_trajectory(n, seed=n, gain=n) for n in (3, 1)]
     saved = [dataclasses.replace(t, reward=t.reward.astype(np.float64)) for t in toy]
-    storage.save_trajectories(tmp_path / "data", saved)
-    loaded = storage.load_trajectories(tmp_path / "data")
+    records.save_trajectories(tmp_path / "data", saved)
+    loaded = records.load_trajectories(tmp_path / "data")
     assert json.loads((tmp_path / "data.json").read_text())[0]["sim_params"] == {"gain": 3.0}
     for old, new in zip(saved, loaded, strict=True):
         assert (new.sim_params, new.terminated) == (old.sim_params, old.terminated)

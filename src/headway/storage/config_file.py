@@ -10,7 +10,7 @@ import jax
 from headway import settings
 from headway.config import Config
 from headway.errors import RunError
-from headway.experiment import files
+from headway.storage import files
 
 SCHEMA = 2  # of a run directory
 UNCHECKED = 1  # the schema before there were checksums

@@ -15,13 +15,13 @@ from headway import settings
 from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import ConfigError, HeadwayError, RunError
-from headway.experiment import config_file, files, storage
-from headway.experiment.config_file import SCHEMA, UNCHECKED
-from headway.experiment.interrupts import StopRequest
-from headway.experiment.manifest import Digest, Manifest, inside
-from headway.experiment.progress_store import ProgressStore
-from headway.experiment.run_lock import LOCK, locked
-from headway.experiment.tables import (
+from headway.storage import config_file, files, records
+from headway.storage.config_file import SCHEMA, UNCHECKED
+from headway.storage.interrupts import StopRequest
+from headway.storage.manifest import Digest, Manifest, inside
+from headway.storage.progress_store import ProgressStore
+from headway.storage.run_lock import LOCK, locked
+from headway.storage.tables import (
     ASSIGNMENT_COLUMNS,
     EVALUATION_COLUMNS,
     PREDICTION_COLUMNS,
@@ -141,7 +141,7 @@ class RunDir:
             RunError: The file is damaged.
         """
         path = self.path / "metrics.jsonl"
-        rows = check_metrics(path, storage.parse_json_lines(path, self._text("metrics.jsonl")))
+        rows = check_metrics(path, records.parse_json_lines(path, self._text("metrics.jsonl")))
         manifest = self.manifest()
         if manifest is not None and manifest.iteration + 1 != len(rows):
             raise files.damaged(path, f"the manifest ends with iteration {manifest.iteration}")
@@ -174,7 +174,7 @@ class RunDir:
     def append_metrics(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """Add metrics behind those of the finished iterations."""
         path = inside(self.path, "metrics.jsonl")
-        lines = storage.json_lines(path, rows)
+        lines = records.json_lines(path, rows)
         files.write_bytes(path, self._text("metrics.jsonl") + lines.encode())
 
     def checkpoint(self, iteration: int) -> Path:
@@ -195,11 +195,11 @@ class RunDir:
 
     def save_data(self, iteration: int, trajectories: list[Trajectory]) -> None:
         """Keep what an iteration collected."""
-        storage.save_trajectories(self._data(iteration), trajectories)
+        records.save_trajectories(self._data(iteration), trajectories)
 
     def iteration_data(self, iteration: int) -> list[Trajectory]:
         """The trajectories that an iteration collected, memory-mapped."""
-        return storage.load_trajectories(self._data(iteration))
+        return records.load_trajectories(self._data(iteration))
 
     def load_data(self) -> list[Trajectory]:
         """All trajectories of the finished iterations, memory-mapped."""
@@ -316,7 +316,7 @@ class RunDir:
         return files.read_bytes(path) if self._schema == UNCHECKED and path.exists() else b""
 
     def _table(self, name: str, columns: tuple[str, ...], parse: Any) -> list[Any]:
-        rows = storage.parse_csv(self.path / name, self._text(name), columns)
+        rows = records.parse_csv(self.path / name, self._text(name), columns)
         if self._schema == UNCHECKED:
             finished = self.finished_iterations
             rows = (row for row in rows if int(row["iteration"]) < finished)
@@ -326,13 +326,13 @@ class RunDir:
         self, name: str, columns: tuple[str, ...], rows: Iterable[Mapping[str, Any]]
     ) -> None:
         before = self._text(name)
-        lines = storage.csv_lines(columns, rows, header=not before)
+        lines = records.csv_lines(columns, rows, header=not before)
         files.write_bytes(inside(self.path, name), before + lines.encode())
 
     def _write_table(
         self, name: str, columns: tuple[str, ...], rows: Iterable[Mapping[str, Any]]
     ) -> None:
-        lines = storage.csv_lines(columns, rows, header=True)
+        lines = records.csv_lines(columns, rows, header=True)
         files.write_bytes(inside(self.path, name), lines.encode())
 
     def _data(self, iteration: int) -> Path:

@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from headway.experiment import arrays, files
-from headway.experiment.arrays import Arrays
-from headway.experiment.interrupts import StopRequest
-from headway.experiment.manifest import Digest, Manifest
+from headway.storage import arrays, files
+from headway.storage.arrays import Arrays
+from headway.storage.interrupts import StopRequest
+from headway.storage.manifest import Digest, Manifest
 
 EVERY = 30.0  # seconds between two writes
 

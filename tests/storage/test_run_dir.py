@@ -12,10 +12,11 @@ import pytest
 
 import headway
 from headway.errors import LimitError, RunError
-from headway.experiment import files, training
-from headway.experiment.manifest import Manifest
-from headway.experiment.runs import RunDir
+from headway.experiment import training
 from headway.report.figures import save_run_figures
+from headway.storage import files
+from headway.storage.manifest import Manifest
+from headway.storage.run_dir import RunDir
 
 DATA = Path(__file__).parent.parent / "data"
 
@@ -139,7 +140,7 @@ def test_lost_manifests_do_not_begin_a_run_anew(root):
 HOLD = """
 import sys
 from pathlib import Path
-from headway.experiment.run_lock import locked
+from headway.storage.run_lock import locked
 with locked(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()

@@ -12,8 +12,8 @@ import safetensors.numpy
 from safetensors import SafetensorError
 
 from headway.errors import RunError
-from headway.experiment import files
-from headway.experiment.files import damaged
+from headway.storage import files
+from headway.storage.files import damaged
 
 Tree = TypeVar("Tree")
 Arrays = dict[str, np.ndarray]

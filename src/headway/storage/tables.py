@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from headway.errors import RunError
-from headway.experiment.files import damaged
+from headway.storage.files import damaged
 
 EVALUATION_COLUMNS = (
     "method", "env", "seed", "iteration", "group", "sim_params", "episode", "return", "length",

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from headway.experiment import files
-from headway.experiment.arrays import Arrays, read_header
+from headway.storage import files
+from headway.storage.arrays import Arrays, read_header
 
 
 def map_arrays(path: Path) -> Arrays:

@@ -7,8 +7,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 from headway.errors import RunError
-from headway.experiment import files
-from headway.experiment.config_file import SCHEMA
+from headway.storage import files
+from headway.storage.config_file import SCHEMA
 
 CHANGED = "its bytes are not the ones that were written"
 

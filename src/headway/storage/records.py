@@ -11,10 +11,10 @@ import numpy as np
 
 from headway.data import Trajectory
 from headway.errors import HeadwayError, RunError
-from headway.experiment import files
-from headway.experiment.arrays import Arrays, save_arrays
-from headway.experiment.files import damaged
-from headway.experiment.mapped import map_arrays
+from headway.storage import files
+from headway.storage.arrays import Arrays, save_arrays
+from headway.storage.files import damaged
+from headway.storage.mapped import map_arrays
 
 Facts = list[dict[str, Any]]
 
