@@ -72,6 +72,11 @@ class ModelConfig:
     adaptation_rate: float = 1e-3
     """Size of that step (gradient-adapted; GrBAL)."""
 
+    @property
+    def learns(self) -> bool:
+        """Whether there is anything to fit; the simulator and random actions need no fit."""
+        return self.kind not in ("simulator", "none")
+
     def __post_init__(self):
         problems = Problems(self)
         problems.at_least(1, "num_members", "num_heads", "history_length")

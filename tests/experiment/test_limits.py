@@ -73,12 +73,14 @@ def test_the_estimate_grows_with_what_takes_the_memory():
 
 
 def test_weights_are_counted(monkeypatch):
-    for name, settings in [
-        ("pendulum", {}),
-        ("hopper", {"model.context_size": 0, "model.backward_net": False}),
-        ("slim-humanoid", {"model.deterministic": True}),
+    for name, method, settings in [
+        ("pendulum", "tmcl", {}),
+        ("hopper", "tmcl", {"model.context_size": 0, "model.backward_net": False}),
+        ("slim-humanoid", "tmcl", {"model.deterministic": True}),
+        ("pendulum", "rebal", {}),
+        ("pendulum", "grbal", {}),
     ]:
-        config = make_config(name, settings=settings)
+        config = make_config(name, method=method, settings=settings)
         task = loading.load_task(config)
         model = loading.eqx.filter_eval_shape(lambda c=config, t=task: loading.initial(c, t))
         leaves = training.jax.tree.leaves(model.fit.model)

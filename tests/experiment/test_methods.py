@@ -1,11 +1,14 @@
 """The table of methods and presets, scores, and the rows of a run's tables."""
 
+import dataclasses
+
 import pytest
 
 from headway.errors import ConfigError, UnknownNameError
 from headway.experiment.evaluation import group_episodes
 from headway.experiment.methods import METHODS, PRESETS, make_config
 from headway.experiment.references import score
+from headway.planning.flop import plan_flop
 from headway.storage.tables import format_sim_params, parse_sim_params
 from headway.tasks.catalog import env_names, env_spec
 
@@ -34,6 +37,15 @@ def test_paper_preset_has_the_supplements_numbers():
     assert fitting.epochs == 50
     assert make_config("pendulum").fitting.epochs == 5
     assert not fitting.bootstrap
+
+
+@pytest.mark.parametrize("method", ["tmcl", "pets"])
+def test_fast_preset_plans_with_a_tenth_of_the_papers_arithmetic_and_changes_nothing_else(method):
+    paper, fast = (make_config("hopper", method=method, preset=name) for name in ("paper", "fast"))
+    task = env_spec("hopper").make_task()
+    costs = [plan_flop(config.model, config.planner, task) for config in (paper, fast)]
+    assert 10 * costs[1] <= costs[0]
+    assert dataclasses.replace(fast, preset="paper", planner=paper.planner) == paper
 
 
 def test_released_code_preset_flips_the_choices_that_differ():

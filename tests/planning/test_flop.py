@@ -47,3 +47,6 @@ def test_knowing_what_is_uncertain_costs_a_product_of_the_features():
     features = 6 + MODEL.context_size + 1
     assert step_flop(MODEL, knowing, toys.POINT) == PER_STEP + 2 * 6 * features
     assert step_flop(MODEL, dataclasses.replace(knowing, adaptation="none"), toys.POINT) == PER_STEP
+    earlier = dataclasses.replace(MODEL, context_at="input")
+    found = step_flop(earlier, knowing, toys.POINT)
+    assert found == step_flop(earlier, PLANNER, toys.POINT) + 2 * 6 * (6 + 1)

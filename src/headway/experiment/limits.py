@@ -85,6 +85,10 @@ def num_parameters(config: Config, task: Task) -> int:
     """Weights of the whole ensemble, to a few percent."""
     model = config.model
     features = 2 * task.obs_size + task.action_size
+    if model.kind == "recurrent":
+        pairs = itertools.pairwise((features, *model.hidden_sizes))
+        gates = sum(4 * (n + m + 1) * m for n, m in pairs)
+        return gates + _dense((model.hidden_sizes[-1], task.obs_size))
     hidden = _dense((features, *model.hidden_sizes))
     context, place = _context_size(config, task), context_layer(model)
     outputs = (model.hidden_sizes[-1] + 1 + (context if place is None else 0)) * task.obs_size
@@ -107,8 +111,10 @@ def _dense(sizes: tuple[int, ...]) -> int:
 
 
 def _batch(config: Config, task: Task) -> int:
-    """Activations of one update, kept for the gradient."""
+    """Activations of one update, kept for the gradient; a recurrent network's in every step."""
     model = config.model
+    if model.kind == "recurrent":
+        return FLOAT * config.fitting.batch_size * 12 * sum(model.hidden_sizes)
     heads = 2 * model.num_heads * (model.hidden_sizes[-1] + 3 * task.obs_size)
     widths = 3 * (sum(model.hidden_sizes) + sum(model.context_hidden_sizes)) + heads
     nets = 2 if model.backward_net else 1

@@ -33,7 +33,7 @@ def step_flop(model: ModelConfig, planner: PlannerConfig, task: Task) -> float:
     are folded into one; their variances are not. Recurrent: four gates per unit. Where nothing
     is learned there are no networks.
     """
-    if model.kind in ("simulator", "none"):
+    if not model.learns:
         return 0.0
     heads_of_variance = model.num_heads if planner.head_selection == "average" else 1
     outputs = 1 + (0 if model.deterministic else heads_of_variance)
@@ -43,5 +43,6 @@ def step_flop(model: ModelConfig, planner: PlannerConfig, task: Task) -> float:
         products = [4 * (n + m) * m for n, m in itertools.pairwise(sizes)]
     total = sum(products) + sizes[-1] * outputs * task.obs_size
     if planner.adaptation != "none" and planner.adaptation_variance:
-        total += sizes[-1] * (sizes[-1] + model.context_size + 1)
+        features = sizes[-1] + 1 + (model.context_size if model.context_at == "head" else 0)
+        total += sizes[-1] * features
     return float(2 * total)

@@ -64,7 +64,8 @@ def run_flop(config: Config, first_iteration: int = 0) -> float:
     """Operations of the matrix products of a run, from some iteration on.
 
     Planning and the updates of the networks are counted: together nearly all of the time at
-    the sizes of the presets `quick` and `paper`.
+    the sizes of the presets `quick` and `paper`. What a simulator computes is not counted, so a
+    run that learns nothing costs nothing here.
 
     Args:
         config: All settings.
@@ -73,7 +74,8 @@ def run_flop(config: Config, first_iteration: int = 0) -> float:
     task, spec = load_task(config), env_spec(config.env)
     length = config.collection.episode_length or spec.episode_length
     per_step = plan_flop(config.model, config.planner, task)
-    per_sample = 6.0 * num_parameters(config, task)  # forwards, and backwards twice as much
+    # Forwards, and backwards twice as much.
+    per_sample = 6.0 * num_parameters(config, task) if config.model.learns else 0.0
     num_unseen = len((config.sim_params or spec.sim_params).group_names) - 1
     total = 0.0
     for iteration in range(first_iteration, config.collection.num_iterations):
