@@ -6,7 +6,11 @@ jaxtyping.install_import_hook(
     ["headway.models", "headway.planning", "headway.data", "headway.tasks"], "beartype.beartype"
 )
 
+import jax  # noqa: E402
+import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
+
+from headway.experiment.limits import resident  # noqa: E402
 
 settings.register_profile(
     "headway",
@@ -16,3 +20,13 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("headway")
+
+MUCH = 3 * 2**30  # bytes
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_compiled_programs():
+    """Keep a worker below a few GiB: JAX holds on to every program that it compiled."""
+    yield
+    if resident() > MUCH:
+        jax.clear_caches()

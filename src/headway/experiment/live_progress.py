@@ -32,7 +32,7 @@ class RichProgress(LiveDisplay, Progress):
     """
 
     def __init__(self, console: Console | None = None, *, clock: Clock = time.monotonic):
-        super().__init__(console, refresh_per_second=4)
+        super().__init__(console)
         self._estimate = Estimate(clock)
         self._iteration = self._num_iterations = self._total = 0
         self._name = ""

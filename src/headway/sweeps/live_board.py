@@ -24,8 +24,10 @@ class LiveBoard(LiveDisplay, Board):
         console: Where to draw; stderr by default.
     """
 
+    refresh_per_second = 2
+
     def __init__(self, console: Console | None = None):
-        LiveDisplay.__init__(self, console, refresh_per_second=2)
+        LiveDisplay.__init__(self, console)
         Board.__init__(self)
 
     def show(self, job: Job, before: Status, status: Status) -> None:
