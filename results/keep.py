@@ -7,6 +7,7 @@ import shutil
 import sys
 from pathlib import Path
 
+from headway.experiment.methods import make_config
 from headway.storage.run_dir import TABLES, RunDir
 
 
@@ -21,7 +22,9 @@ def keep(run: RunDir, folder: Path) -> Path:
     if run.finished_iterations < config.collection.num_iterations:
         raise SystemExit(f"{run.path} is not finished; the command that began it resumes it.")
     selection = config.planner.head_selection
-    arm = config.method if selection == "adaptive" else f"{config.method}-{selection}"
+    usual = make_config(config.env, method=config.method, preset=config.preset)
+    own = selection == usual.planner.head_selection
+    arm = config.method if own else f"{config.method}-{selection}"
     kept = folder / arm / f"seed-{config.seed}"
     kept.mkdir(parents=True, exist_ok=True)
     for name in ("config.json", *TABLES):
