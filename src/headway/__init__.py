@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from headway.report.diagnosis import diagnose as diagnose
     from headway.report.dynamics import plot_dynamics as plot_dynamics
     from headway.report.page.build import write_report as write_report
+    from headway.report.recording import Recording as Recording
+    from headway.report.recording import record as record
     from headway.sim_params import SimParamSets as SimParamSets
     from headway.storage.run_dir import RunDir as RunDir
     from headway.storage.tables import EpisodeRow as EpisodeRow
@@ -71,6 +73,7 @@ _HOME = {
     "report.diagnosis": ("Diagnosis", "diagnose"),
     "report.dynamics": ("plot_dynamics",),
     "report.page.build": ("write_report",),
+    "report.recording": ("Recording", "record"),
     "sim_params": ("SimParamSets",),
     "storage.run_dir": ("RunDir",),
     "storage.tables": ("EpisodeRow",),

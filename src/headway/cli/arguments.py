@@ -64,7 +64,8 @@ SECTIONS = {
 }
 
 
-WithSettings = TypeVar("WithSettings", bound="Train | Evaluate")
+WithSettings = TypeVar("WithSettings", bound="Train | Evaluate | Record")
+AboutRun = TypeVar("AboutRun", bound="Evaluate | Record")
 
 
 def with_settings(arguments: WithSettings, config: Config) -> WithSettings:
@@ -148,6 +149,36 @@ class Evaluate:
     evaluation: EvaluationSettings = dataclasses.field(default_factory=EvaluationSettings)
 
     def with_defaults(self, config: Config) -> "Evaluate":
+        """The same arguments with the settings of a run."""
+        return with_settings(self, config)
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """Film an episode of a trained run, with the heads that it plans with; GIF or WebP.
+
+    The defaults shown are those of the run named before --help.
+    """
+
+    run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    """The run directory."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("episode.gif")
+    """The file to write; .gif or .webp."""
+    sim_params: Annotated[tuple[str, ...], _unset("drawn from the training physics")] = ()
+    """Physics, for example length=1.75."""
+    schedule: Annotated[tuple[str, ...], _unset("physics stay")] = ()
+    """Physics that change during the episode, for example 60:length=0.5 120:length=1."""
+    seed: int = 0
+    """Seeds the start and the planner."""
+    steps: Annotated[int | None, _unset("a full episode")] = None
+    """Steps to film."""
+    json: Flag = False
+    """Print one JSON line on stdout instead of text."""
+    quiet: Flag = False
+    """Show no progress."""
+    planner: PlannerSettings = dataclasses.field(default_factory=PlannerSettings)
+
+    def with_defaults(self, config: Config) -> "Record":
         """The same arguments with the settings of a run."""
         return with_settings(self, config)
 

@@ -13,14 +13,13 @@ from headway.cli.arguments import (
     List,
     PlotDynamics,
     Train,
-    WithSettings,
-    changed_settings,
 )
 from headway.cli.comparisons import reproduce, sweep
+from headway.cli.defaults import parse_for_run, parse_twice
 from headway.cli.output import print_json as _print_json
 from headway.cli.output import print_tables as _print_tables
-from headway.cli.reports import diagnose, report
-from headway.cli.usage import UsageError, parse, wants_help
+from headway.cli.reports import diagnose, record, report
+from headway.cli.usage import UsageError, parse
 from headway.config import Config
 from headway.errors import ConfigError, unknown_name
 
@@ -79,7 +78,7 @@ def train(words: Sequence[str]) -> int:
 
 def evaluate(words: Sequence[str]) -> int:
     """`headway evaluate`."""
-    arguments, settings = parse_evaluate(words)
+    arguments, settings = parse_for_run(Evaluate(run=tyro.MISSING), words, "headway evaluate")
     from headway import api
     from headway.experiment.progress import make_progress
 
@@ -134,6 +133,7 @@ def plot_dynamics(words: Sequence[str]) -> int:
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "train": train,
     "evaluate": evaluate,
+    "record": record,
     "reproduce": reproduce,
     "sweep": sweep,
     "list": list_names,
@@ -156,59 +156,13 @@ def parse_train(words: Sequence[str]) -> tuple[Train, dict[str, Any]]:
         return make_config(first.env, method=first.method, preset=first.preset)
 
     plain = Train(env=tyro.MISSING)
-    arguments, config, settings = _parse_twice(plain, asked, words, "headway train")
+    arguments, config, settings = parse_twice(plain, asked, words, "headway train")
     if arguments.env_options:
         chosen = _env_options(arguments.env, arguments.env_options)
         settings["env_options"] = {**config.env_options, **chosen}
     if arguments.sim_params is not None:
         settings["sim_params"] = _read_sim_params(arguments.sim_params)
     return arguments, settings
-
-
-def parse_evaluate(words: Sequence[str]) -> tuple[Evaluate, dict[str, Any]]:
-    """Parse `headway evaluate`, whose defaults are the run's.
-
-    Returns:
-        The arguments, and every setting that differs from the run's.
-    """
-
-    def trained(first: Evaluate) -> Config:
-        from headway.storage.run_dir import RunDir
-
-        return RunDir(first.run).config()
-
-    plain = Evaluate(run=tyro.MISSING)
-    arguments, _, settings = _parse_twice(plain, trained, words, "headway evaluate")
-    return arguments, settings
-
-
-def _parse_twice(
-    plain: WithSettings, read: Callable[[WithSettings], Config], words: Sequence[str], prog: str
-) -> tuple[WithSettings, Config, dict[str, Any]]:
-    """Parse once to learn whose settings are the defaults, and once more with these.
-
-    Args:
-        plain: The command's arguments as they are before anything is known.
-        read: Finds the configuration that the arguments of the first step name.
-        words: What was typed after the command's name.
-        prog: The command's name.
-
-    Returns:
-        The arguments, the configuration, and every setting that differs from it.
-    """
-    command = type(plain)
-    try:
-        first = parse(command, plain, [w for w in words if not wants_help([w])], prog)
-    except UsageError:
-        if wants_help(words):
-            parse(command, plain, ["--help"], prog)
-        raise
-    config = read(first)
-    default = plain.with_defaults(config)
-    if wants_help(words):
-        parse(command, default, ["--help"], prog)
-    arguments = parse(command, default, words, prog)
-    return arguments, config, changed_settings(arguments, default)
 
 
 def _env_options(env: str, words: Sequence[str]) -> dict[str, bool]:

@@ -1,0 +1,154 @@
+"""Films: the picture, the physics in force and the heads that planned, step by step."""
+
+import io
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image, ImageColor
+
+from headway import cli
+from headway.errors import BadEnvironmentError, ConfigError
+from headway.experiment.loading import load_task
+from headway.experiment.methods import make_config
+from headway.planning.acting import RandomAgent
+from headway.report import film, recording
+from headway.report.style import HEADS, INK
+from headway.storage.run_dir import RunDir
+
+SCENE = (240, 320)
+
+
+def moment(step, length=1.0, heads=(0, 1)):
+    image = np.full((*SCENE, 3), 250, np.uint8)
+    image[step % 200 : step % 200 + 4] = (200, 40, 40)
+    chosen = None if heads is None else np.array(heads)
+    return SimpleNamespace(image=image, sim_params={"length": length}, reward=-1.0, heads=chosen)
+
+
+def frames(content):
+    film_ = Image.open(io.BytesIO(content))
+    shown = []
+    for index in range(film_.n_frames):
+        film_.seek(index)
+        shown.append((np.asarray(film_.convert("RGB")).astype(int), film_.info["duration"]))
+    return shown
+
+
+def near(image, color):
+    """Pixels of a colour, as far as a palette keeps it."""
+    return (np.abs(image - np.array(ImageColor.getrgb(color))).sum(-1) < 40).nonzero()
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".webp"])
+def test_a_film_runs_at_the_speed_of_the_environment(suffix):
+    shown = frames(film.draw([moment(step) for step in range(10)], 20.0, suffix))
+    assert len(shown) == 10
+    assert {duration for _, duration in shown[:-1]} == {50}
+    faster = frames(film.draw([moment(step) for step in range(10)], 100.0, suffix))
+    assert len(faster) == 4  # steps 0, 4, 8 and the last
+    assert faster[0][1] == 40
+
+
+def test_strips_show_who_planned_until_now():
+    heads = [(0, 1)] * 10 + [(2, 1)] * 10
+    shown = frames(film.draw([moment(i, heads=h) for i, h in enumerate(heads)], 20.0, ".gif"))
+    first, last = shown[0][0], shown[-1][0]
+    bottom = film.WIDTH * SCENE[0] // SCENE[1]
+    widths = []
+    for color in HEADS[:3]:
+        rows, columns = near(last[bottom:], color)
+        widths.append((np.ptp(columns) + 1, rows.min()))
+        assert len(near(first[bottom:], color)[0]) < len(rows)
+    wide = film.WIDTH - 2 * film.MARGIN
+    # Head 1 planned all the time, in the second row; heads 0 and 2 half of it each, in the first.
+    assert widths[1][0] == pytest.approx(wide, abs=3)
+    assert widths[0][0] == pytest.approx(wide / 2, abs=3)
+    assert widths[2][0] == pytest.approx(wide / 2, abs=3)
+    assert widths[0][1] == widths[2][1] < widths[1][1]
+
+
+def test_a_line_marks_where_the_physics_changed():
+    steps = [moment(i, length=1.0 if i < 5 else 0.5) for i in range(10)]
+    last = frames(film.draw(steps, 20.0, ".gif"))[-1][0]
+    strips = last[-film.MARGIN - 15 : -film.MARGIN]
+    columns = near(strips, INK)[1]
+    assert np.median(columns) == pytest.approx(film.WIDTH / 2, abs=3)
+
+
+def test_without_heads_there_are_no_strips():
+    plain = frames(film.draw([moment(i, heads=None) for i in range(3)], 20.0, ".gif"))[0][0]
+    with_heads = frames(film.draw([moment(i) for i in range(3)], 20.0, ".gif"))[0][0]
+    assert len(plain) < len(with_heads)
+
+
+@pytest.fixture
+def run_dir(tmp_path, monkeypatch):
+    """A run whose agent acts at random."""
+    monkeypatch.setattr(recording, "load_agent", lambda run, config: RandomAgent(load_task(config)))
+    run = RunDir(tmp_path / "run")
+    run.create_or_resume(make_config("pendulum", preset="smoke"))
+    return run.path
+
+
+def test_an_episode_is_filmed_under_the_physics_that_were_asked_for(run_dir, tmp_path):
+    def film_it(name, **asked):
+        return recording.record(run_dir, tmp_path / name, seed=3, **asked)
+
+    found = film_it("a.gif", sim_params={"length": 1.75}, schedule={4: {"mass": 2.0}}, num_steps=8)
+    assert (found.env, found.steps) == ("pendulum", 8)
+    assert found.sim_params == {"length": 1.75, "mass": 2.0}
+    assert Image.open(found.path).n_frames == 8
+    again = film_it("b.gif", sim_params={"length": 1.75}, schedule={4: {"mass": 2.0}}, num_steps=8)
+    assert again.path.read_bytes() == found.path.read_bytes()
+    assert again.episode_return == found.episode_return
+    other = film_it("c.gif", num_steps=8)
+    assert other.sim_params["length"] in (0.5, 0.75, 1.0, 1.25)  # training physics
+    assert other.episode_return != found.episode_return
+    assert (
+        film_it("d.gif").steps == make_config("pendulum", preset="smoke").collection.episode_length
+    )
+
+
+@pytest.mark.parametrize(
+    ("asked", "reason"),
+    [
+        ({"output": "film.mp4"}, "film.mp4 cannot be a film, allowed: names ending in .gif"),
+        ({"num_steps": 0}, "num_steps is 0"),
+        ({"sim_params": {"lenth": 1.0}}, "Did you mean 'length'"),
+        ({"schedule": {3: {"mass": -1.0}}}, "mass"),
+        ({"settings": {"model.num_heads": 1}}, "model.num_heads"),
+    ],
+)
+def test_what_cannot_be_filmed_is_refused_and_nothing_is_written(asked, reason, run_dir, tmp_path):
+    asked = {"output": tmp_path / "film.gif", "num_steps": 2} | asked
+    with pytest.raises(ConfigError, match=reason):
+        recording.record(run_dir, **asked)
+    assert not list(tmp_path.glob("*.gif"))
+
+
+def test_an_environment_that_draws_nothing_is_named(run_dir, tmp_path, monkeypatch):
+    made = recording._environment(RunDir(run_dir).config())
+    monkeypatch.setattr(type(made), "render", lambda self: None)
+    with pytest.raises(BadEnvironmentError, match="gave NoneType, allowed: an image"):
+        recording.record(run_dir, tmp_path / "film.gif", num_steps=2)
+
+
+def test_the_command_line_reads_physics_and_schedule(run_dir, tmp_path, monkeypatch, capsys):
+    calls = []
+
+    def record(run, output, **asked):
+        calls.append(asked)
+        return recording.Recording(output, "pendulum", {"length": 1.0}, 5, -7.25)
+
+    monkeypatch.setattr(recording, "record", record)
+    words = ["--sim-params", "length=1.75", "--schedule", "60:length=0.5", "60:mass=2", "90:mass=1"]
+    code = cli.main(["record", str(run_dir), *words, "--planner.horizon", "7", "--quiet"])
+    assert code == 0
+    assert calls[0]["sim_params"] == {"length": 1.75}
+    assert calls[0]["schedule"] == {60: {"length": 0.5, "mass": 2.0}, 90: {"mass": 1.0}}
+    assert calls[0]["settings"] == {"planner.horizon": 7}
+    assert capsys.readouterr().out == "episode.gif: 5 steps, return -7.2\n"
+    for wrong in (["--schedule", "length=2"], ["--schedule", "5:length"], ["--sim-params", "x"]):
+        assert cli.main(["record", str(run_dir), *wrong]) == 2
+    assert capsys.readouterr().err.count("error: ") == 3
