@@ -13,6 +13,7 @@ from headway import envs
 from headway.errors import BadEnvironmentError
 from headway.experiment import training
 from headway.experiment.rollouts import Arena, Episode, random_policy, run_episodes
+from headway.experiment.testing import run_tests
 from headway.sim_params import SimParamSets
 from headway.storage.interrupts import StopRequest
 from headway.tasks import catalog
@@ -108,6 +109,10 @@ def test_tests_that_break_stop_the_run_until_they_may_be_left_out(drift, sound, 
         number,
     ]
     assert len(run.evaluation()) == len(training.RunDir(tmp_path / "run").evaluation()) - 1
+    (tmp_path / "once").unlink()
+    settings = {**PROCESSES, "evaluation.max_bad_episodes": 1}
+    again = run_tests(run.path, groups=["far"], settings=settings).trajectories
+    assert len(again["far"]) == number - 1
     drift("give_up", drift=FAR)  # all of a group
     lenient = config(**{"evaluation.max_bad_episodes": 99})
     with pytest.raises(BadEnvironmentError, match="and not all"):

@@ -1,5 +1,6 @@
 """Environments in processes of their own: equal results, and what hangs or crashes is given up."""
 
+import contextlib
 import functools
 import os
 import signal
@@ -159,6 +160,19 @@ def test_an_interrupted_answer_is_not_taken_for_the_next(tmp_path):
     vector.close()
 
 
+def test_only_the_parent_answers_a_request_to_stop():
+    """A scheduler sends SIGTERM to every process of a job, and the parent saves first."""
+    vector = made()
+    vector.reset(seed=0)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        os.killpg(vector.pids[0], number)
+        assert "broken" not in vector.step(ones(vector))[-1]
+    os.killpg(vector.pids[0], signal.SIGKILL)
+    info = vector.step(ones(vector))[-1]
+    assert info["broken"] == {0: "had its process killed by SIGKILL during step"}
+    vector.close()
+
+
 @pytest.mark.parametrize("how", ["change_spaces", "change_actions"])
 def test_spaces_must_stay_as_they_are(how):
     for vector in (made(how, at=0), SequentialVectorEnv(some(how, at=0))):
@@ -208,22 +222,40 @@ def test_no_process_outlives_its_parent():
     """Environments hang in C, and have started processes of their own; or one raises."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     all_parents = subprocess.Popen(
-        [sys.executable, "-c", PARENT], stdout=subprocess.PIPE, env=environment, text=True
+        [sys.executable, "-c", PARENT],
+        stdout=subprocess.PIPE,
+        env=environment,
+        text=True,
+        process_group=0,
     )
+    assert all_parents.stdout is not None
     parents = [list(map(int, all_parents.stdout.readline().split())) for _ in range(4)]
-    workers = [pid for _, *pids in parents for pid in pids]
-    assert len(workers) == 8
-    signals = [signal.SIGINT, signal.SIGTERM, signal.SIGKILL]
-    while signals:
-        for parent, first, _ in parents:
-            if len(members(first)) == 3:  # the guard, the environment, and its own process
-                os.kill(parent, signals.pop())
+    hanging = {parent: workers[0] for parent, *workers in parents}
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+            ready = wait_for(
+                lambda: [p for p, group in hanging.items() if len(members(group)) == 3]
+            )
+            del hanging[ready[0]]
+            os.kill(ready[0], number)
+        all_parents.communicate(timeout=60)
+        assert all(gone(pid) for _, *workers in parents for pid in workers)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(all_parents.pid, signal.SIGKILL)
+        all_parents.wait()
+
+
+def wait_for(found):
+    """Wait until there is something."""
+    for _ in range(400):
+        if result := found():
+            return result
         time.sleep(0.05)
-    all_parents.communicate(timeout=60)
-    assert all(map(gone, workers))
+    raise AssertionError("nothing came")
 
 
 def members(group):
-    """The processes of a group."""
+    """The processes of a group: the guard, the environment, and what that has started."""
     found = subprocess.run(["ps", "-A", "-o", "pgid="], capture_output=True, text=True, check=True)
     return [word for word in found.stdout.split() if int(word) == group]

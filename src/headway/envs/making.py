@@ -76,15 +76,15 @@ def make_vec(
         BadEnvironmentError: An environment could not be made in its process.
     """
     spec = env_spec(name_or_id)
-    options: dict[str, Any] = dict(options or {})
-    _check_options(spec, options, spec.options)
+    given: dict[str, Any] = dict(options or {})
+    _check_options(spec, given, spec.options)
     sets = sim_params or spec.sim_params
     length = spec.episode_length if episode_length is None else episode_length
     built_in = _built_in(spec)
     if built_in is not None and step_timeout_s is None:
-        return _vector(_WORLDS[built_in](sets, **options), num_envs, autoreset_mode, length)
+        return _vector(_WORLDS[built_in](sets, **given), num_envs, autoreset_mode, length)
     if built_in is not None:  # these draw physics themselves
-        options |= {"sim_params": sets, "disable_env_checker": True}
+        given |= {"sim_params": sets, "disable_env_checker": True}
     shared: dict[str, Any] = {
         "sim_params": None if built_in is not None else sets,
         "autoreset_mode": autoreset_mode,
@@ -92,7 +92,7 @@ def make_vec(
     }
     # A longer episode than Gymnasium's own limit must be possible, so ours replaces it.
     registered = gymnasium.spec(spec.env_id)  # another process may not have registered it
-    one = functools.partial(gymnasium.make, registered, max_episode_steps=length, **options)
+    one = functools.partial(gymnasium.make, registered, max_episode_steps=length, **given)
     if step_timeout_s is None:
         return SequentialVectorEnv([one] * num_envs, **shared)
     return ProcessVectorEnv([one] * num_envs, step_timeout_s=step_timeout_s, **shared)

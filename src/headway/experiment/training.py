@@ -203,6 +203,7 @@ class Trainer:
                 break
             rollbacks += 1
             self.roll_back(problem, f"epoch {len(history)} of iteration {iteration}", rollbacks)
+            self.store.stop_if_asked()
         return {
             "loss": float(history[-1].loss),
             "forward_loss": float(history[-1].forward_loss),

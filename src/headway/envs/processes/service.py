@@ -54,6 +54,8 @@ class Service:
 def main() -> None:
     """Make the environment that is sent, and answer until the other end is gone."""
     connection = Connection(int(sys.argv[1]))
+    for number in (signal.SIGINT, signal.SIGTERM):  # schedulers send them to every process
+        signal.signal(number, lambda *_: None)
     stay_with(connection.fileno())
     sys.path[:] = connection.recv()
     made = answer(lambda: Service(connection.recv()()))

@@ -59,14 +59,15 @@ class Worker:
         Raises:
             BadEnvironmentError: It could not be made.
         """
-        if self._spaces is None:
-            try:
-                self._spaces = self.receive("start", START_TIMEOUT_S, time.monotonic())
-            except BrokenEpisodeError as error:
-                raise BadEnvironmentError(
-                    f"an environment {error}; see to it that it can be made in a new process."
-                ) from None
-        return self._spaces
+        if self._spaces is not None:
+            return self._spaces
+        try:
+            self._spaces = spaces = self.receive("start", START_TIMEOUT_S, time.monotonic())
+        except BrokenEpisodeError as error:
+            raise BadEnvironmentError(
+                f"an environment {error}; see to it that it can be made in a new process."
+            ) from None
+        return spaces
 
     def send(self, method: str, given: tuple[Any, ...]) -> None:
         """Call a method of `Service`."""
@@ -90,14 +91,15 @@ class Worker:
                 this itself. The process is of no use any more, but for the last case.
             Exception: What else the environment raised.
         """
-        call = -1
-        while call != self._calls:  # there may be answers that were interrupted
+        while True:
             if not self._connection.poll(max(0.0, since + timeout_s - time.monotonic())):
                 raise LostWorkerError(f"did not answer to {method} within {timeout_s:g} s")
             try:
                 call, kind, *found = self._connection.recv()
             except (EOFError, ConnectionResetError):
                 raise LostWorkerError(f"{self._fate()} during {method}") from None
+            if call == self._calls:  # else nobody waited for this answer
+                break
         if kind == "raised":
             raise _raised(*found)
         return found[0]
@@ -105,7 +107,8 @@ class Worker:
     def _fate(self) -> str:
         """How the process ended."""
         found = os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOWAIT)
-        code = found.si_status if found else 0
+        assert found is not None
+        code = found.si_status if found.si_code == os.CLD_EXITED else 128 + found.si_status
         if code <= 128:
             return f"ended its process with exit code {code}"
         name = signal.Signals(code - 128).name if code - 128 in set(signal.Signals) else code
