@@ -1,9 +1,11 @@
 """Let a controller serve for very many steps: memory, traces, deadlines kept.
 
+    python benchmarks/soak.py --steps 1000000
     python benchmarks/soak.py --steps 1000000 --deadline-ms 20
 
-The world is a pendulum's Task with an untrained model of the `smoke` preset: what is tested is
-the service, not the control. Prints a line of JSON per report and one at the end. Linux.
+The world is a pendulum's Task with an untrained model of a few units: what is tested is the
+service, not the control. `--minutes` stops it earlier. Prints a line of JSON per report and one
+at the end, which says how long a million steps would take at the same pace. Linux.
 """
 
 import argparse
@@ -21,50 +23,76 @@ from headway.planning import agent as agent_module
 from headway.planning.controller import Controller
 
 REPORTS = 20
+WARM_UP = 2000
+"""Steps before anything is counted; they compile, and let memory settle."""
+TINY = {
+    "model.num_members": 1,
+    "model.hidden_sizes": (8,),
+    "model.context_hidden_sizes": (8,),
+    "model.backward_net": False,
+    "planner.num_particles": 1,
+    "planner.num_candidates": 10,
+    "planner.num_elites": 2,
+    "planner.horizon": 5,
+    "planner.num_iterations": 2,
+}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Let a controller serve for very many steps.")
     parser.add_argument("--steps", type=int, default=1_000_000)
     parser.add_argument("--deadline-ms", type=float, default=None)
-    parser.add_argument("--candidates", type=int, default=20)
+    parser.add_argument("--minutes", type=float, default=float("inf"))
     asked = parser.parse_args()
+    print(json.dumps(soak(asked.steps, asked.deadline_ms, asked.minutes)))
+
+
+def soak(steps: int, deadline_ms: float | None, minutes: float = float("inf")) -> dict:
+    """Serve, and say what it took.
+
+    Args:
+        steps: How many.
+        deadline_ms: The controller's; None for none.
+        minutes: After which no further part of the steps is begun.
+    """
     traces = count_traces()
-    controller = Controller(small_agent(asked.candidates), deadline_ms=asked.deadline_ms)
-    serve(controller, 2000)  # compiles, and lets memory settle
-    before, traces_before, started = resident(), len(traces), time.perf_counter()
+    controller = Controller(tiny_agent(), deadline_ms=deadline_ms)
+    serve(controller, WARM_UP)
+    seconds = np.full(steps, np.nan, np.float32)  # this memory is taken before it is measured
+    memory, traces_before, started = [resident()], len(traces), time.perf_counter()
     outcomes: dict[str, int] = {}
-    seconds = np.zeros(asked.steps, np.float32)
-    for done in range(0, asked.steps, max(1, asked.steps // REPORTS)):
-        steps = min(asked.steps // REPORTS or 1, asked.steps - done)
-        seconds[done : done + steps] = serve(controller, steps, outcomes)
-        print(json.dumps({"steps": done + steps, "resident_mib": resident() / 2**20}), flush=True)
+    done, part = 0, max(1, steps // REPORTS)
+    while done < steps and time.perf_counter() - started < 60 * minutes:
+        number = min(part, steps - done)
+        seconds[done : done + number] = serve(controller, number, outcomes)
+        done += number
+        memory.append(resident())
+        print(json.dumps({"steps": done, "resident_mib": memory[-1] / 2**20}), flush=True)
+    taken = (time.perf_counter() - started) / 60
+    half = memory[len(memory) // 2]
     facts = {
-        "steps": asked.steps,
-        "deadline_ms": asked.deadline_ms,
+        "steps": done,
+        "deadline_ms": deadline_ms,
         "outcomes": outcomes,
-        "grown_mib": (resident() - before) / 2**20,
+        "grown_mib": (memory[-1] - memory[0]) / 2**20,
+        "grown_in_second_half_mib": (memory[-1] - half) / 2**20,
         "live_arrays": len(jax.live_arrays()),
         "new_traces": len(traces) - traces_before,
         "milliseconds": {
-            name: float(1000 * np.quantile(seconds, share))
+            name: float(1000 * np.quantile(seconds[:done], share))
             for name, share in (("median", 0.5), ("99%", 0.99), ("99.9%", 0.999), ("longest", 1.0))
         },
-        "minutes": (time.perf_counter() - started) / 60,
+        "minutes": taken,
+        "minutes_per_million": taken / done * 1e6,
     }
-    if asked.deadline_ms:
-        facts["late"] = int((1000 * seconds > asked.deadline_ms).sum())
-    print(json.dumps(facts))
+    if deadline_ms:
+        facts["late"] = int((1000 * seconds[:done] > deadline_ms).sum())
+    return facts
 
 
-def small_agent(num_candidates: int):
-    """An agent that plans in well under a millisecond on any machine of today."""
-    settings = {
-        "planner.num_candidates": num_candidates,
-        "planner.num_elites": max(1, num_candidates // 5),
-        "planner.horizon": 5,
-    }
-    config = make_config("pendulum", preset="smoke", settings=settings)
+def tiny_agent():
+    """An untrained agent that plans in a fraction of a millisecond."""
+    config = make_config("pendulum", preset="smoke", settings=TINY)
     task = load_task(config)
     return learner_of(config, task).agent(initial(config, task))
 

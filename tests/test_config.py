@@ -14,7 +14,15 @@ from headway.config import (
     PlannerConfig,
 )
 from headway.errors import ConfigError
-from headway.settings import differences, from_dict, override, setting_names, to_dict
+from headway.settings import (
+    TOLERANCE,
+    differences,
+    from_dict,
+    override,
+    setting_names,
+    to_dict,
+    tolerating_as,
+)
 from headway.sim_params import SimParamSets
 
 SETS = SimParamSets({"length": (0.5, 1.0)}, {"long": {"length": (1.5, 2.0)}})
@@ -185,6 +193,8 @@ def test_a_section_that_is_no_table_is_refused(value):
         (PlannerConfig, {"temperature": 0.0}),
         (PlannerConfig, {"noise_beta": -1.0, "population_decay": 0.9, "kept_elite_fraction": 1.1}),
         (CollectionConfig, {"num_iterations": 0, "num_episodes": 0, "episode_length": -1}),
+        (CollectionConfig, {"max_bad_episodes": -1, "step_timeout_s": 0.0}),
+        (EvaluationConfig, {"max_bad_episodes": -1}),
         (EvaluationConfig, {"every": 0, "num_episodes": 0, "seed": -1, "training_group": "no"}),
     ],
 )
@@ -246,3 +256,25 @@ def test_differences_name_each_changed_setting_with_both_values():
     assert any(line.startswith("env_options") for line in lines)
     assert all("hopper" not in line for line in lines)
     assert differences(old, from_dict(json.loads(json.dumps(to_dict(old))))) == []
+
+
+def test_plans_on_the_simulator_need_it_in_their_own_process():
+    plain = {"num_members": 1, "num_heads": 1, "context_size": 0, "backward_net": False}
+    model = ModelConfig(kind="simulator", deterministic=True, **plain)
+    planner = PlannerConfig(num_particles=1)
+    Config(env="pendulum", model=model, planner=planner)
+    with pytest.raises(ConfigError, match=r"collection\.env_processes is True, allowed: False"):
+        Config(
+            "pendulum",
+            model=model,
+            planner=planner,
+            collection=CollectionConfig(env_processes=True),
+        )
+
+
+def test_what_is_tolerated_of_environments_is_taken_over_and_nothing_else():
+    other = override(changed(), {name: 9 for name in TOLERANCE if "max" in name})
+    other = override(other, {"collection.env_processes": True, "planner.horizon": 3})
+    found = tolerating_as(changed(), other)
+    assert len(differences(changed(), found)) == 3
+    assert differences(found, other) == ["planner.horizon: 30 -> 3"]

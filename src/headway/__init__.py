@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from headway.data import ReplayBuffer as ReplayBuffer
     from headway.data import Trajectory as Trajectory
     from headway.errors import BadEnvironmentError as BadEnvironmentError
+    from headway.errors import BrokenEpisodeError as BrokenEpisodeError
     from headway.errors import ConfigError as ConfigError
     from headway.errors import DivergenceError as DivergenceError
     from headway.errors import HeadwayError as HeadwayError
@@ -60,6 +61,7 @@ _HOME = {
         "ConfigError",
         "DivergenceError",
         "BadEnvironmentError",
+        "BrokenEpisodeError",
         "HeadwayError",
         "LimitError",
         "RunError",

@@ -305,12 +305,19 @@ class CollectionConfig:
     episode_length: int = 0
     """Steps per episode; 0 takes the environment's own."""
     max_bad_episodes: int = 1
-    """Most episodes of an iteration that are dropped for a number that is not finite."""
+    """Most episodes of an iteration that are dropped because they broke: a number was not finite,
+    a simulation diverged, a process hung or died."""
+    env_processes: bool = False
+    """Whether every environment runs in a process of its own, also in tests, so that one that
+    hangs or crashes costs its episode only; slower where steps are quick."""
+    step_timeout_s: float = 60.0
+    """Seconds that a step or reset may take before its process is given up (env_processes)."""
 
     def __post_init__(self):
         problems = Problems(self)
         problems.at_least(1, "num_iterations", "num_episodes")
         problems.at_least(0, "episode_length", "max_bad_episodes")
+        problems.between(1e-3, 1e6, "step_timeout_s")
         problems.report()
 
 
@@ -326,10 +333,14 @@ class EvaluationConfig:
     """When the training physics are tested too: after the last iteration, or at every test."""
     seed: int = 10_000
     """Seed of the first test episode; the others follow it."""
+    max_bad_episodes: int = 0
+    """Most test episodes of an iteration that are left out because they broke; what is left may
+    look better than it is."""
 
     def __post_init__(self):
         problems = Problems(self)
         problems.at_least(1, "every")
+        problems.at_least(0, "max_bad_episodes")
         problems.between(1, 1000, "num_episodes")
         problems.between(0, 2**30, "seed")
         problems.one_of("training_group", ("last", "always"))
@@ -380,5 +391,9 @@ class Config:
             self.model.kind != "simulator" or self.planner.reward == "task",
             f"planner.reward is {shown(self.planner.reward)}, allowed: task, which the simulator"
             " pays",
+        )
+        problems.require(
+            self.model.kind != "simulator" or not self.collection.env_processes,
+            "collection.env_processes is True, allowed: False with plans on the simulator itself",
         )
         problems.report()

@@ -28,6 +28,13 @@ class BadEnvironmentError(HeadwayError, RuntimeError):
     """An environment broke its contract: wrong shape, non-finite values."""
 
 
+class BrokenEpisodeError(BadEnvironmentError):
+    """An episode cannot go on, though the environment can begin another one.
+
+    An environment of your own may raise it: training then drops the episode.
+    """
+
+
 class RunError(HeadwayError, RuntimeError):
     """A run directory is missing, damaged, or belongs to another configuration."""
 

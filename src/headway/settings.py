@@ -10,6 +10,15 @@ from headway.config import Config
 from headway.errors import ConfigError, shown
 from headway.sim_params import SimParamSets
 
+TOLERANCE = (
+    "collection.max_bad_episodes",
+    "collection.env_processes",
+    "collection.step_timeout_s",
+    "evaluation.max_bad_episodes",
+)
+"""What is done about environments that break; the numbers of sound episodes do not depend on it,
+so a run may go on with other values."""
+
 
 def to_dict(config: Config) -> dict[str, Any]:
     """Return the settings as nested dictionaries of plain values."""
@@ -70,6 +79,12 @@ def differences(old: Config, new: Config) -> list[str]:
         for name in sorted({*before, *after})
         if before.get(name) != after.get(name)
     ]
+
+
+def tolerating_as(config: Config, other: Config) -> Config:
+    """Return `config` with the `TOLERANCE` of another one."""
+    values = flatten(to_dict(other))
+    return override(config, {name: values[name] for name in TOLERANCE})
 
 
 def unknown_setting(name: str, known: list[str]) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Collection
 from pathlib import Path
 
 from headway.config import Config
@@ -23,8 +24,8 @@ TINY = {
 ALWAYS, NEVER = 0.0, 1e9  # seconds between two writes of progress
 
 
-def tiny_config(**settings) -> Config:
-    return make_config("pendulum", preset="smoke", settings={**TINY, **settings})
+def tiny_config(env: str = "pendulum", **settings) -> Config:
+    return make_config(env, preset="smoke", settings={**TINY, **settings})
 
 
 class Killed(BaseException):
@@ -124,7 +125,17 @@ def train(config: Config, path: Path, monkeypatch, *, kill_at: int = 0, every: f
     return trigger
 
 
-def result(path: Path) -> dict:
+class Listening(Progress):
+    """Remembers what was said."""
+
+    def __init__(self):
+        self.said = []
+
+    def message(self, text):
+        self.said.append(text)
+
+
+def result(path: Path, without: Collection[str] = ()) -> dict:
     """Everything that a run leaves behind, apart from times and what depends on them."""
     RunDir(path).check()
     metrics = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
@@ -132,7 +143,7 @@ def result(path: Path) -> dict:
         str(file.relative_to(path)): file.read_bytes()
         for file in sorted(path.rglob("*"))
         if file.is_file()
-        and file.name not in ("metrics.jsonl", ".lock")
+        and file.name not in ("metrics.jsonl", ".lock", *without)
         and not {"manifests", "tensorboard"} & set(file.parts)
     }
     names = [

@@ -7,7 +7,7 @@ from env_helpers import NAMES, ROBOTS, actions_of, all_physics, record
 from gymnasium.utils.env_checker import check_env
 
 from headway import envs
-from headway.errors import BadEnvironmentError, ConfigError, UnknownNameError
+from headway.errors import BrokenEpisodeError, ConfigError, UnknownNameError
 from headway.sim_params import SimParamSets
 from headway.tasks.catalog import env_spec
 
@@ -194,7 +194,7 @@ def test_a_simulation_that_diverges_is_told(tmp_path, monkeypatch):
     state = env.unwrapped.get_state()
     state[9:18] = 1e12
     env.unwrapped.set_state(state)
-    with pytest.raises(BadEnvironmentError, match="diverged under sim_params"):
+    with pytest.raises(BrokenEpisodeError, match=r"diverged \(BADQVEL\) under sim_params"):
         env.step(env.action_space.sample())
 
 

@@ -6,7 +6,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 from headway import envs
-from headway.envs.vector import SequentialVectorEnv
+from headway.envs import SequentialVectorEnv
 from headway.errors import ConfigError
 
 CHANGES = {

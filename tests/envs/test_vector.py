@@ -192,10 +192,21 @@ def test_a_simulation_that_diverges_is_told(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log there
     vector = envs.make_vec("half-cheetah", 3)
     vector.reset(seed=0)
+    plain = envs.make_vec("half-cheetah", 3)
+    plain.reset(seed=0)
     vector._state[1, 0, 10:19] = 1e12
-    with pytest.raises(BadEnvironmentError, match="diverged under sim_params"):
-        vector.step(vector.action_space.sample())
+    action = vector.action_space.sample()
+    obs, reward, terminated, truncated, info = vector.step(action)
+    assert info["broken"] == {1: "the simulation of half-cheetah diverged (BADQVEL)"}
+    assert (terminated.any(), truncated.tolist()) == (False, [False, True, False])
+    assert np.isnan(obs).all(1).tolist() == np.isnan(reward).tolist() == [False, True, False]
+    np.testing.assert_array_equal(obs[[0, 2]], plain.step(action)[0][[0, 2]])
+    obs, _, _, _, info = vector.step(action)  # the next episode begins
+    assert "broken" not in info
+    assert np.isfinite(obs).all()
+    assert np.isfinite(vector.step(action)[0]).all()
     vector.close()
+    plain.close()
 
 
 def test_more_environments_than_processors():

@@ -69,6 +69,7 @@ def test_the_estimate_grows_with_what_takes_the_memory():
     assert need(**{"collection.num_episodes": 20}).data == 10 * base.data
     assert need(**{"model.num_members": 4, "planner.num_particles": 4}).model == 2 * base.model
     assert need(**{"fitting.batch_size": 320}).fitting > base.fitting
+    assert need(**{"collection.env_processes": True}).process > base.process
     assert need(preset="paper", env="half-cheetah").total < 8 * GIB
 
 
@@ -140,7 +141,7 @@ def test_an_accelerator_has_a_memory_of_its_own(monkeypatch):
 
 MEASURE = """
 import json, resource, sys, tempfile
-from headway.experiment import training
+from headway.experiment import loading, training
 from headway.experiment.methods import make_config
 env, settings = json.loads(sys.argv[1])
 config = make_config(env, preset="smoke", settings=settings)

@@ -3,7 +3,9 @@
 from headway.envs.classic import CartPoleSwingUpEnv, PendulumEnv
 from headway.envs.locomotion import CrippledAntEnv, HalfCheetahEnv, HopperEnv, SlimHumanoidEnv
 from headway.envs.making import make, make_vec, register_all
-from headway.envs.vector import HeadwayVectorEnv, SequentialVectorEnv
+from headway.envs.processes.vector import ProcessVectorEnv
+from headway.envs.separate import SequentialVectorEnv
+from headway.envs.vector import HeadwayVectorEnv
 from headway.envs.vector_worlds import ClassicVectorEnv, RolloutVectorEnv
 
 __all__ = [
@@ -14,6 +16,7 @@ __all__ = [
     "HeadwayVectorEnv",
     "HopperEnv",
     "PendulumEnv",
+    "ProcessVectorEnv",
     "RolloutVectorEnv",
     "SequentialVectorEnv",
     "SlimHumanoidEnv",

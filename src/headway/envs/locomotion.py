@@ -40,7 +40,7 @@ class LocomotionEnv(WorldEnv):
 
         Raises:
             ConfigError: The action has the wrong shape or is not finite.
-            BadEnvironmentError: The simulation diverged.
+            BrokenEpisodeError: The simulation diverged.
         """
         robot, data = self._world, self.data
         action = robot.clip(action, (self.model.nu,))

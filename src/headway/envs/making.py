@@ -9,8 +9,10 @@ import gymnasium
 from gymnasium.vector import AutoresetMode
 
 from headway.envs.classic import CartPoleWorld, ClassicWorld, PendulumWorld
+from headway.envs.processes.vector import ProcessVectorEnv
 from headway.envs.robots import CrippledAnt, HalfCheetah, Hopper, Robot, SlimHumanoid
-from headway.envs.vector import HeadwayVectorEnv, SequentialVectorEnv, WorldVectorEnv
+from headway.envs.separate import SequentialVectorEnv
+from headway.envs.vector import HeadwayVectorEnv, WorldVectorEnv
 from headway.envs.vector_worlds import ClassicVectorEnv, RolloutVectorEnv
 from headway.envs.world import World
 from headway.errors import unknown_name
@@ -54,6 +56,7 @@ def make_vec(
     options: Mapping[str, bool] | None = None,
     autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     episode_length: int | None = None,
+    step_timeout_s: float | None = None,
 ) -> HeadwayVectorEnv:
     """Make many environments that step together, each with physics of its own.
 
@@ -64,27 +67,35 @@ def make_vec(
         options: Boolean options of the environment.
         autoreset_mode: NEXT_STEP or DISABLED, see `HeadwayVectorEnv`.
         episode_length: Steps after which an episode is cut; None takes the catalog's.
+        step_timeout_s: Steps every environment in a process of its own, and gives it up when a
+            step takes longer (`ProcessVectorEnv`); None steps all in this process.
 
     Raises:
         UnknownNameError: No such environment or option.
         ConfigError: A number or a parameter is not allowed.
+        BadEnvironmentError: An environment could not be made in its process.
     """
     spec = env_spec(name_or_id)
-    options = dict(options or {})
-    _check_options(spec, options, spec.options)
+    given: dict[str, Any] = dict(options or {})
+    _check_options(spec, given, spec.options)
     sets = sim_params or spec.sim_params
     length = spec.episode_length if episode_length is None else episode_length
     built_in = _built_in(spec)
-    if built_in is not None:
-        return _vector(_WORLDS[built_in](sets, **options), num_envs, autoreset_mode, length)
+    if built_in is not None and step_timeout_s is None:
+        return _vector(_WORLDS[built_in](sets, **given), num_envs, autoreset_mode, length)
+    if built_in is not None:  # these draw physics themselves
+        given |= {"sim_params": sets, "disable_env_checker": True}
+    shared: dict[str, Any] = {
+        "sim_params": None if built_in is not None else sets,
+        "autoreset_mode": autoreset_mode,
+        "episode_length": length,
+    }
     # A longer episode than Gymnasium's own limit must be possible, so ours replaces it.
-    one = functools.partial(gymnasium.make, spec.env_id, max_episode_steps=length, **options)
-    return SequentialVectorEnv(
-        [one] * num_envs,
-        sim_params=sets,
-        autoreset_mode=autoreset_mode,
-        episode_length=length,
-    )
+    registered = gymnasium.spec(spec.env_id)  # another process may not have registered it
+    one = functools.partial(gymnasium.make, registered, max_episode_steps=length, **given)
+    if step_timeout_s is None:
+        return SequentialVectorEnv([one] * num_envs, **shared)
+    return ProcessVectorEnv([one] * num_envs, step_timeout_s=step_timeout_s, **shared)
 
 
 def _vector(

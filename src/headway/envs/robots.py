@@ -20,7 +20,7 @@ import numpy as np
 
 from headway.envs.rendering import GREY, Camera, paint, restyle
 from headway.envs.world import World
-from headway.errors import BadEnvironmentError
+from headway.errors import BrokenEpisodeError
 from headway.sim_params import SimParamSets
 from headway.tasks.base import Task
 from headway.tasks.locomotion import (
@@ -83,17 +83,29 @@ class Robot(World):
         velocity = (qpos[..., 0] - before.qpos[..., 0]) / self.time_step
         return RobotState(qpos, qvel, velocity)
 
+    def warning(self, data: mujoco.MjData) -> str:
+        """What MuJoCo warns of, or nothing: non-finite or huge numbers, or full buffers.
+
+        It would quietly start over from the nominal state.
+        """
+        counts = data.warning.number
+        if not counts.any():
+            return ""
+        name = mujoco.mjtWarning(int(np.argmax(counts))).name.removeprefix("mjWARN_")
+        return f"the simulation of {self.name} diverged ({name})"
+
     def check_warnings(self, data: mujoco.MjData, sim_params: Mapping[str, Any]) -> None:
-        """Notice that MuJoCo gave up on a state; it would quietly start over from the nominal.
+        """Notice that MuJoCo gave up on a state.
 
         Raises:
-            BadEnvironmentError: MuJoCo warned of non-finite or huge numbers, or of full buffers.
+            BrokenEpisodeError: MuJoCo warned.
         """
-        if data.warning.number.any():
+        warning = self.warning(data)
+        if warning:
             physics = {name: float(value) for name, value in sim_params.items()}
-            raise BadEnvironmentError(
-                f"the simulation of {self.name} diverged under sim_params {physics}, allowed:"
-                " finite states; use less extreme sim_params."
+            raise BrokenEpisodeError(
+                f"{warning} under sim_params {physics}, allowed: finite states; use less extreme"
+                " sim_params."
             )
 
 

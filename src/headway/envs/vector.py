@@ -1,7 +1,8 @@
 """Many environments stepped at once, each with its own physics."""
 
 import abc
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -12,8 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from headway.envs.schedule import read_schedules
 from headway.envs.world import SimParams, World, read_options
-from headway.errors import BadEnvironmentError, ConfigError
-from headway.sim_params import SimParamSets
+from headway.errors import BrokenEpisodeError, ConfigError
 
 Seeds = int | Sequence[int | None] | None
 
@@ -24,6 +24,8 @@ class Outcome(NamedTuple):
     reward: np.ndarray
     terminated: np.ndarray
     truncated: np.ndarray
+    broken: Mapping[int, str] = MappingProxyType({})
+    """Environments whose episode cannot go on, and why."""
 
 
 class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -42,6 +44,10 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     starts the next episode with physics drawn from the training values, and pays 0. With
     `AutoresetMode.DISABLED` a finished environment stands still, pays 0 and repeats its last
     observation and flags until it is reset.
+
+    An episode that breaks (a simulation diverged, a process hung) does not disturb the others:
+    it is truncated, pays NaN, has NaN as its last observation, and `info["broken"]` says why,
+    by environment.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as in Gymnasium)
@@ -69,6 +75,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.episode_length = episode_length
         self._elapsed = np.zeros(num_envs, int)
         self._ends = np.zeros((2, num_envs), bool)
+        self._broken: dict[int, str] = {}
         self._sim_params: dict[str, np.ndarray] = {}
         self._schedules: list[dict[int, SimParams]] = [{}] * num_envs
 
@@ -89,7 +96,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._start(chosen, seeds, requested)
         for i in chosen:
             self._schedules[i] = schedules[i]
-        return self._observe(), self._info()
+        return self._observe_sound(), self._info()
 
     def step(
         self, actions: np.ndarray
@@ -98,7 +105,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Raises:
             ConfigError: Actions have the wrong shape or are not finite.
-            BadEnvironmentError: A simulation diverged.
+            BadEnvironmentError: An environment returned something misshapen.
         """
         actions = self._check_actions(actions)
         rewards = np.zeros(self.num_envs)
@@ -110,15 +117,19 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             nothing = [{}] * self.num_envs
             self._start(np.flatnonzero(restart), [None] * self.num_envs, nothing)
         active = np.flatnonzero(~self._finished & ~restart)
+        broken = self._follow_schedules(active)
+        active = np.setdiff1d(active, list(broken))
         if active.size:
-            self._follow_schedules(active)
             outcome = self._advance(active, actions)
             self._elapsed[active] += 1
-            rewards[active], terminated[active], truncated[active] = outcome
+            rewards[active], terminated[active], truncated[active] = outcome[:3]
+            broken |= outcome.broken
             if self.episode_length is not None:
                 truncated[active] |= self._elapsed[active] >= self.episode_length
+        rewards[list(broken)], truncated[list(broken)] = np.nan, True
+        self._broken |= broken
         self._ends = np.stack([terminated, truncated])
-        return self._observe(), rewards, terminated, truncated, self._info()
+        return self._observe_sound(), rewards, terminated, truncated, self._info()
 
     @property
     def _finished(self) -> np.ndarray:
@@ -130,27 +141,43 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return {name: values.copy() for name, values in self._sim_params.items()}
 
     def _info(self) -> dict[str, Any]:
-        return {"sim_params": self.sim_params}
+        broken = {"broken": dict(self._broken)} if self._broken else {}
+        return {"sim_params": self.sim_params, **broken}
+
+    def _observe_sound(self) -> np.ndarray:
+        """All observations; nothing is known of where an episode broke."""
+        obs, broken = self._observe(), list(self._broken)
+        if broken and obs.dtype.kind == "f":
+            obs[broken] = np.nan
+        return obs
 
     def _start(
         self, chosen: np.ndarray, seeds: Sequence[int | None], requested: Sequence[SimParams]
     ) -> None:
-        for i in chosen:
-            values = self._begin(int(i), seeds[i], requested[i])
+        self._elapsed[chosen] = 0
+        self._ends[:, chosen] = False
+        for i, begun in self._begin(chosen, seeds, requested).items():
+            self._broken.pop(i, None)
+            values = requested[i] if isinstance(begun, BrokenEpisodeError) else begun
+            if isinstance(begun, BrokenEpisodeError):
+                self._broken[i], self._ends[1, i] = str(begun), True
             for name, value in values.items():
                 self._sim_params.setdefault(name, np.full(self.num_envs, np.nan))[i] = value
             self._schedules[i] = {}
-        self._elapsed[chosen] = 0
-        self._ends[:, chosen] = False
 
-    def _follow_schedules(self, active: np.ndarray) -> None:
-        """Change the physics of the environments where it is time to."""
+    def _follow_schedules(self, active: np.ndarray) -> dict[int, str]:
+        """Change the physics of the environments where it is time to; return what broke."""
+        broken = {}
         for i in active:
-            changed = self._schedules[i].get(int(self._elapsed[i]))
-            if changed:
-                self._change(int(i), changed)
-                for name, value in changed.items():
-                    self._sim_params[name][i] = value
+            changed = self._schedules[i].get(int(self._elapsed[i])) or {}
+            try:
+                if changed:
+                    self._change(int(i), changed)
+            except BrokenEpisodeError as error:
+                broken[int(i)] = str(error)
+            for name, value in changed.items():
+                self._sim_params[name][i] = value
+        return broken
 
     def _read_seeds(self, seed: Seeds) -> list[int | None]:
         if seed is None or isinstance(seed, int | np.integer):
@@ -191,8 +218,14 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return values
 
     @abc.abstractmethod
-    def _begin(self, i: int, seed: int | None, requested: SimParams) -> SimParams:
-        """Start an episode in environment `i` and return its simulator parameters."""
+    def _begin(
+        self, chosen: np.ndarray, seeds: Sequence[int | None], requested: Sequence[SimParams]
+    ) -> dict[int, SimParams | BrokenEpisodeError]:
+        """Start episodes in the environments of the given indices.
+
+        Returns:
+            Their simulator parameters, or why an episode cannot begin.
+        """
 
     @abc.abstractmethod
     def _change(self, i: int, changed: SimParams) -> None:
@@ -233,7 +266,12 @@ class WorldVectorEnv(HeadwayVectorEnv):
     def _check_sim_params(self, values: dict[str, Any]) -> SimParams:
         return self._world.check(values)
 
-    def _begin(self, i: int, seed: int | None, requested: SimParams) -> SimParams:
+    def _begin(
+        self, chosen: np.ndarray, seeds: Sequence[int | None], requested: Sequence[SimParams]
+    ) -> dict[int, SimParams | BrokenEpisodeError]:
+        return {int(i): self._begin_one(int(i), seeds[i], requested[i]) for i in chosen}
+
+    def _begin_one(self, i: int, seed: int | None, requested: SimParams) -> SimParams:
         rng = self._rngs[i]
         if rng is None or seed is not None:
             rng = self._rngs[i] = seeding.np_random(seed)[0]
@@ -252,91 +290,3 @@ class WorldVectorEnv(HeadwayVectorEnv):
 
     def _apply_sim_params(self, i: int, sim_params: SimParams) -> None:
         """Change the physics of environment `i`; nothing to do where they are read."""
-
-
-class SequentialVectorEnv(HeadwayVectorEnv):
-    """Any Gymnasium environments, stepped one after the other.
-
-    For environments of your own: they must take `options={"sim_params": {name: value}}` in
-    `reset`, end no step with NaN, and share their spaces.
-
-    Args:
-        env_fns: Make the environments.
-        sim_params: Draws the parameters that `reset` is not told; None leaves that to the
-            environments, which must then return them in `info["sim_params"]`.
-        autoreset_mode: What happens after the end of an episode.
-        episode_length: Steps after which an episode is cut; None leaves it to the environments.
-    """
-
-    def __init__(
-        self,
-        env_fns: Sequence[Callable[[], gymnasium.Env]],
-        *,
-        sim_params: SimParamSets | None = None,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        episode_length: int | None = None,
-    ):
-        self.envs = [make() for make in env_fns]
-        if not self.envs:
-            raise ConfigError("env_fns is empty, allowed: at least one.")
-        spaces = self.envs[0].observation_space, self.envs[0].action_space
-        super().__init__(len(self.envs), spaces, autoreset_mode, episode_length)
-        self._sets = sim_params
-        self._rngs = [seeding.np_random()[0] for _ in self.envs]
-        self._obs: list[Any] = [np.zeros(spaces[0].shape or ()) for _ in self.envs]
-
-    def _begin(self, i: int, seed: int | None, requested: SimParams) -> SimParams:
-        if self._sets is not None:
-            if seed is not None:
-                self._rngs[i] = seeding.np_random(seed)[0]
-            requested = self._sets.sample(self._rngs[i]) | requested
-        options = {"sim_params": requested} if requested else None
-        obs, info = self.envs[i].reset(seed=seed, options=options)
-        self._obs[i] = self._check_obs(obs)
-        return requested | info.get("sim_params", {})
-
-    def _advance(self, active: np.ndarray, actions: np.ndarray) -> Outcome:
-        rewards, terminated, truncated = [], [], []
-        for i in active:
-            obs, reward, ends, cut, _ = self.envs[i].step(actions[i])
-            self._obs[i] = self._check_obs(obs)
-            rewards.append(_number(reward))
-            terminated.append(bool(ends))
-            truncated.append(bool(cut))
-        return Outcome(np.array(rewards), np.array(terminated), np.array(truncated))
-
-    def _change(self, i: int, changed: SimParams) -> None:
-        change = getattr(self.envs[i].unwrapped, "set_sim_params", None)
-        if change is None:
-            raise ConfigError(
-                "schedule was given, but the environment has no method set_sim_params(values); add"
-                " one, or leave the schedule out."
-            )
-        change(changed)
-
-    def _check_obs(self, obs: Any) -> np.ndarray:
-        allowed = self.single_observation_space.shape
-        if np.shape(obs) != allowed:
-            raise BadEnvironmentError(
-                f"an environment returned obs of shape {np.shape(obs)}, allowed: {allowed}, as"
-                " its observation_space says; correct the environment."
-            )
-        return np.asarray(obs)
-
-    def _observe(self) -> np.ndarray:
-        return np.stack(self._obs)
-
-    def close_extras(self, **kwargs: Any) -> None:
-        """Close the environments."""
-        for env in self.envs:
-            env.close()
-
-
-def _number(reward: Any) -> float:
-    try:
-        return float(reward)
-    except (TypeError, ValueError):
-        raise BadEnvironmentError(
-            f"an environment returned the reward {reward!r}, allowed: a number; correct the"
-            " environment."
-        ) from None

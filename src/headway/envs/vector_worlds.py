@@ -135,14 +135,16 @@ class RolloutVectorEnv(WorldVectorEnv):
         self._control[:] = robot.control(actions, self._sim_params)[:, None, None]
         self._roll_out(active)
         self._state[active] = self._states[active, :, -1]
-        for i in active:
-            sim_params = {name: values[i] for name, values in self._sim_params.items()}
-            robot.check_warnings(self._datas[i], sim_params)
         after = robot.after_step(before, *self._positions())
         self._velocity[active] = after.velocity[active]
         reward = robot.reward(before, actions, after)
         no = np.zeros(len(active), bool)
-        return Outcome(reward[active], no, no)
+        return Outcome(reward[active], no, no, self._given_up(active))
+
+    def _given_up(self, active: np.ndarray) -> dict[int, str]:
+        """The environments that MuJoCo warns of."""
+        warnings = {int(i): self._world.warning(self._datas[i]) for i in active}
+        return {i: warning for i, warning in warnings.items() if warning}
 
     def _roll_out(self, active: np.ndarray) -> None:
         """Share the environments among the threads, this one included."""

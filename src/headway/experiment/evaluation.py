@@ -2,20 +2,21 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax
 from jaxtyping import PRNGKeyArray
 
 from headway.config import Config
 from headway.data import Trajectory
+from headway.experiment.bad_episodes import BadEpisodes
+from headway.experiment.progress import Progress
 from headway.experiment.resumable import resumable_episodes
 from headway.experiment.rollouts import (
     AgentPolicy,
     Arena,
     Episode,
     PlannerUse,
-    accept,
     run_episodes,
 )
 from headway.planning.acting import Acting
@@ -79,7 +80,7 @@ def evaluate_agent(
     groups: Sequence[str],
     *,
     key: PRNGKeyArray,
-    on_step: Callable[[int], None] = lambda steps: None,
+    progress: Progress,
     store: ProgressStore | None = None,
 ) -> tuple[dict[str, list[Trajectory]], PlannerUse]:
     """Run the test episodes of some groups, as many side by side as the batch holds.
@@ -90,12 +91,15 @@ def evaluate_agent(
         config: Settings of the run.
         groups: `train` or unseen groups.
         key: The planner's draws.
-        on_step: Called after each step with the number of environments that stepped.
+        progress: Counts the steps, and says which episodes broke.
         store: Keeps what is done, for when the process is killed.
 
     Returns:
-        The trajectories of each group, in the order of their episodes, and what planning them
-        took.
+        The trajectories of each group, in the order of their episodes without those that broke,
+        and what planning them took.
+
+    Raises:
+        BadEnvironmentError: More episodes broke than allowed, or all of a group.
     """
     evaluation = config.evaluation
     episodes = [
@@ -107,22 +111,23 @@ def evaluate_agent(
     ]
     found: dict[str, list[Trajectory]] = {group: [] for group in groups}
     size, use = arena.vector.num_envs, PlannerUse()
+    allowed, forget = evaluation.max_bad_episodes, store.drop if store else lambda name: None
+    bad = BadEpisodes("evaluation.max_bad_episodes", allowed, progress.message, forget)
     for chunk, start in enumerate(range(0, len(episodes), size)):
         batch = episodes[start : start + size]
         chunk_key = jax.random.fold_in(key, chunk)
         side_by_side = [episode for _, episode in batch]
         policy = functools.partial(AgentPolicy, agent, size, side_by_side, key=chunk_key)
+        name = f"evaluate-{chunk}"
         if store is None:
-            rollout = run_episodes(arena, side_by_side, policy(), on_step)
+            rollout = run_episodes(arena, side_by_side, policy(), progress.advance)
         else:
-            rollout = resumable_episodes(
-                store, f"evaluate-{chunk}", arena, side_by_side, policy, on_step
-            )
-        # To leave a test out would flatter the agent, or wrong it.
-        accept(rollout, 0, lambda reason: None)
+            rollout = resumable_episodes(store, name, arena, side_by_side, policy, progress.advance)
+        bad.leave_out(name, list(rollout.broken.values()))
         use += rollout.use
-        for (group, _), trajectory in zip(batch, rollout.trajectories, strict=True):
-            found[group].append(trajectory)
+        for number, trajectory in zip(rollout.numbers, rollout.trajectories, strict=True):
+            found[batch[number][0]].append(trajectory)
+    bad.want_some(min(map(len, found.values()), default=1))
     return found, use
 
 

@@ -14,6 +14,7 @@ from headway.models.dynamics import context_layer, context_size
 from headway.tasks.base import Task
 
 PROCESS = 650 * 2**20  # Python, JAX, a simulator and compiled code, measured
+WORKER = 120 * 2**20  # a process with an environment, its simulator included, measured
 FLOAT = 4  # bytes
 MEMINFO = Path("/proc/meminfo")
 CGROUP = Path("/proc/self/cgroup")
@@ -26,7 +27,7 @@ class MemoryNeed(NamedTuple):
     """Bytes that a run needs at its peak, within a factor of 2."""
 
     process: int
-    """Before any array."""
+    """Before any array; with the processes of the environments."""
     model: int
     """Weights and Adam's moments, with the copies that an update and a checkpoint make."""
     data: int
@@ -72,8 +73,9 @@ def memory_need(config: Config, task: Task, episode_length: int) -> MemoryNeed:
     # Number of the episode, anchor and offset: in rows, as a table, padded, on the device.
     table = samples * 4 * 3 * FLOAT
     rows = members * samples * FLOAT
+    workers = collection.num_episodes if collection.env_processes else 0
     return MemoryNeed(
-        PROCESS,
+        PROCESS + workers * WORKER,
         16 * FLOAT * num_parameters(config, task),
         episodes + table + rows,
         6 * rows + _batch(config, task) + _assignment(config, task, episode_length),

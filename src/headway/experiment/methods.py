@@ -10,7 +10,7 @@ from typing import Any
 
 from headway.config import PLAIN, Config
 from headway.errors import ConfigError, unknown_name
-from headway.settings import override, setting_names
+from headway.settings import TOLERANCE, override, setting_names
 from headway.tasks.catalog import EnvSpec, env_spec
 
 Settings = Mapping[str, Any]
@@ -318,13 +318,14 @@ def config_to_evaluate(config: Config, settings: Settings) -> Config:
 
     Args:
         config: The settings that the run was trained with.
-        settings: Changes by dotted name, of the sections in `EVALUATED_SECTIONS` only.
+        settings: Changes by dotted name, of the sections in `EVALUATED_SECTIONS` only, and of
+            what is done about environments that break (`settings.TOLERANCE`).
 
     Raises:
         ConfigError: A setting is unknown, of the wrong type or out of range, or one that
             training has fixed.
     """
-    for name in settings:
+    for name in set(settings) - set(TOLERANCE):
         if name in setting_names(config) and name.partition(".")[0] not in EVALUATED_SECTIONS:
             raise ConfigError(
                 f"{name} is fixed by training, allowed: settings of"

@@ -158,7 +158,8 @@ def resumable_episodes(
 def _finished(rollout: Rollout) -> Part:
     facts = trajectory_facts(rollout.trajectories)
     use = dataclasses.asdict(rollout.use)
-    kept = {"trajectories": facts, "use": use, "broken": list(rollout.broken)}
+    broken = [[number, reason] for number, reason in rollout.broken.items()]
+    kept = {"trajectories": facts, "use": use, "broken": broken}
     return Part(trajectory_arrays(rollout.trajectories), kept)
 
 
@@ -166,10 +167,22 @@ def _restore(part: Part, num_episodes: int, path: Path) -> Rollout:
     trajectories = trajectories_from(part.arrays, part.facts.get("trajectories"), path)
     use = part.facts.get("use")
     broken = part.facts.get("broken", [])
-    texts = isinstance(broken, list) and all(isinstance(text, str) for text in broken)
-    if not texts or len(trajectories) + len(broken) != num_episodes or not _is_use(use):
+    if not _are_broken(broken, num_episodes) or not _is_use(use):
+        raise damaged(path, "it does not say what broke, or what planning took")
+    rollout = Rollout(trajectories, PlannerUse(**use), dict(broken))
+    if len(trajectories) + len(rollout.broken) != num_episodes:
         raise damaged(path, f"it does not hold {num_episodes} episodes")
-    return Rollout(trajectories, PlannerUse(**use), tuple(broken))
+    return rollout
+
+
+def _are_broken(values: Any, num_episodes: int) -> bool:
+    """Whether something read from a file is numbers of episodes and reasons."""
+    return isinstance(values, list) and all(
+        isinstance(value, list)
+        and [type(entry) for entry in value] == [int, str]
+        and 0 <= value[0] < num_episodes
+        for value in values
+    )
 
 
 def _is_use(values: Any) -> TypeGuard[dict[str, Any]]:

@@ -3,10 +3,9 @@
 One vector environment and one compiled agent serve collection and evaluation alike.
 """
 
-import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -18,7 +17,8 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from headway import envs
 from headway.config import Config
 from headway.data import Trajectory
-from headway.errors import BadEnvironmentError, HeadwayError
+from headway.errors import BadEnvironmentError
+from headway.experiment.bad_episodes import Watch
 from headway.planning.acting import Acting
 from headway.planning.controller import env_action
 from headway.sim_params import SimParamSets
@@ -53,27 +53,33 @@ class Arena:
         Raises:
             BadEnvironmentError: The environment's spaces do not fit its Task.
         """
-        spec = env_spec(config.env)
+        spec, collection = env_spec(config.env), config.collection
         options = {**spec.options, **config.env_options}
         task = spec.make_task(**options)
-        length = config.collection.episode_length or spec.episode_length
+        length = collection.episode_length or spec.episode_length
         sim_params = config.sim_params or spec.sim_params
         vector = envs.make_vec(
             config.env,
-            config.collection.num_episodes,
+            collection.num_episodes,
             sim_params=sim_params,
             options=options,
             autoreset_mode=AutoresetMode.DISABLED,
             episode_length=length,
+            step_timeout_s=collection.step_timeout_s if collection.env_processes else None,
         )
         got = (vector.single_observation_space.shape, vector.single_action_space.shape)
         allowed = ((task.obs_size,), (task.action_size,))
         if got != allowed:
+            vector.close()
             raise BadEnvironmentError(
                 f"{config.env} has observation and action shapes {got}, allowed: {allowed}, as"
                 f" its Task says; correct the environment or the Task."
             )
         return cls(spec, task, vector, sim_params, length)
+
+    def close(self) -> None:
+        """Free what the environments hold, and end their processes."""
+        self.vector.close()
 
 
 class Choice(NamedTuple):
@@ -160,24 +166,14 @@ class Rollout:
 
     trajectories: list[Trajectory]
     use: PlannerUse
-    broken: tuple[str, ...] = ()
-    """What was wrong with each episode that is left out."""
+    broken: Mapping[int, str] = dataclasses.field(default_factory=dict)
+    """What was wrong with each episode that is left out, by its number among those asked for."""
 
-
-def accept(rollout: Rollout, allowed: int, say: Callable[[str], None]) -> None:
-    """Say which episodes were left out, unless there are too many.
-
-    Raises:
-        BadEnvironmentError: There are more than allowed, or nothing is left.
-    """
-    broken = rollout.broken
-    if len(broken) > allowed or (broken and not rollout.trajectories):
-        raise BadEnvironmentError(
-            f"{len(broken)} episodes broke, allowed: {allowed}, and not all; the first:"
-            f" {broken[0]}. Check the environment under these physics."
-        )
-    for reason in broken:
-        say(f"{reason}; the episode is dropped.")
+    @property
+    def numbers(self) -> list[int]:
+        """The number of each trajectory's episode among those asked for."""
+        asked = range(len(self.trajectories) + len(self.broken))
+        return [number for number in asked if number not in self.broken]
 
 
 def run_episodes(
@@ -194,8 +190,8 @@ def run_episodes(
         policy: Chooses the actions.
         on_step: Called after each step with the number of environments that stepped.
 
-    An episode with a number that is not finite ends there and is left out; the other
-    environments go on.
+    An episode that breaks (`HeadwayVectorEnv`), or with a number that is not finite, ends there
+    and is left out; the other environments go on.
 
     Raises:
         BadEnvironmentError: The environment raised, or returned something misshapen.
@@ -208,9 +204,10 @@ def run_episodes(
     options: dict[str, Any] = {"sim_params": sim_params}
     if any(episode.schedule for episode in filled):
         options["schedule"] = [episode.schedule for episode in filled]
-    watch = Watch(arena, filled)
+    watch = Watch(arena.spec.name, [episode.sim_params for episode in filled])
     with watch.raising("reset"):
-        obs, _ = arena.vector.reset(seed=seeds, options=options)
+        obs, info = arena.vector.reset(seed=seeds, options=options)
+    watch.note(info, 0)
     obs = watch.finite(obs, "obs", 0, np.zeros((len(filled), arena.task.obs_size)))
     observations, actions, rewards = [obs], [], []
     length = np.zeros(len(filled), np.int64)
@@ -225,8 +222,9 @@ def run_episodes(
         if step and choice.timed:  # the first one may compile
             use += PlannerUse(timed_steps=len(filled), seconds=seconds)
         with watch.raising(f"step {step + 1}"):
-            obs, reward, ends, cut, _ = arena.vector.step(env_action(arena.task, choice.action))
+            obs, reward, ends, cut, info = arena.vector.step(env_action(arena.task, choice.action))
         watch.running = running
+        watch.note(info, step + 1)
         obs = watch.finite(obs, "obs", step + 1, observations[-1])
         observations.append(obs)
         rewards.append(watch.finite(reward, "reward", step + 1, np.zeros(len(filled))))
@@ -243,71 +241,12 @@ def run_episodes(
         for row in range(wanted)
         if not watch.broken[row]
     ]
-    return Rollout(trajectories, use, tuple(watch.reasons[row] for row in watch.rows(wanted)))
+    return Rollout(trajectories, use, watch.among(wanted))
 
 
 def fill(episodes: Sequence[Episode], num_envs: int) -> list[Episode]:
     """Give every environment of a batch an episode; surplus ones repeat the last."""
     return [*episodes, *[episodes[-1]] * (num_envs - len(episodes))]
-
-
-class Watch:
-    """Looks at what the environments return, and notes the episodes that break."""
-
-    def __init__(self, arena: Arena, episodes: Sequence[Episode]):
-        self._arena, self._episodes = arena, episodes
-        self.running = np.ones(len(episodes), bool)
-        self.reasons: dict[int, str] = {}
-
-    @property
-    def broken(self) -> Bool[np.ndarray, " env"]:
-        """The environments whose episode broke."""
-        return np.isin(np.arange(len(self._episodes)), list(self.reasons))
-
-    def rows(self, wanted: int) -> list[int]:
-        """The first `wanted` environments whose episode broke."""
-        return [row for row in range(wanted) if row in self.reasons]
-
-    @contextlib.contextmanager
-    def raising(self, when: str) -> Iterator[None]:
-        """Turn whatever an environment raises into one line.
-
-        Raises:
-            BadEnvironmentError: It raised.
-        """
-        try:
-            yield
-        except HeadwayError:
-            raise
-        except Exception as error:
-            reason = " ".join(str(error).split())[:300]
-            raise BadEnvironmentError(
-                f"{self._arena.spec.name} raised {type(error).__name__} at {when}: {reason};"
-                " correct the environment, then the same command goes on."
-            ) from error
-
-    def finite(self, values: Any, what: str, step: int, instead: np.ndarray) -> np.ndarray:
-        """What was returned, with `instead` where it is not finite; those episodes are broken.
-
-        Raises:
-            BadEnvironmentError: The values have another shape, or are no numbers.
-        """
-        name = self._arena.spec.name
-        values = np.asarray(values)
-        if values.shape != instead.shape or values.dtype.kind not in "fiub":
-            raise BadEnvironmentError(
-                f"{name} returned {what} of shape {values.shape} and type {values.dtype} at step"
-                f" {step}, allowed: numbers of shape {instead.shape}; correct the environment."
-            )
-        bad = ~np.isfinite(values.reshape(len(values), -1)).all(1)
-        for row in np.flatnonzero(bad & self.running).tolist():
-            physics = self._episodes[row].sim_params
-            self.reasons.setdefault(
-                row, f"{name} returned a non-finite {what} at step {step} under {physics}"
-            )
-        if not bad.any():
-            return values
-        return np.where(bad.reshape(-1, *[1] * (values.ndim - 1)), instead, values)
 
 
 def _cut(table, row: int, length: int, episode: Episode, terminated: bool) -> Trajectory:

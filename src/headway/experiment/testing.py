@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -74,9 +75,9 @@ def run_tests(
             raise unknown_name("group", group, known)
     groups = list(dict.fromkeys(groups or known))
     iteration = run.finished_iterations - 1
-    with progress or Progress() as shown:
+    with progress or Progress() as shown, closing(arena):
         total = len(groups) * config.evaluation.num_episodes * arena.episode_length
         shown.phase(iteration, run.finished_iterations, "evaluate", total)
         key = jax.random.key(config.evaluation.seed)
-        found, use = evaluate_agent(agent, arena, config, groups, key=key, on_step=shown.advance)
+        found, use = evaluate_agent(agent, arena, config, groups, key=key, progress=shown)
     return Tested(config, iteration, agent, arena, found, use)

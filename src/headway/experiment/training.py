@@ -13,6 +13,7 @@ from jaxtyping import PRNGKeyArray
 from headway.config import Config
 from headway.data import ReplayBuffer, Trajectory
 from headway.errors import BadEnvironmentError, DivergenceError
+from headway.experiment.bad_episodes import BadEpisodes
 from headway.experiment.divergence import SLOWER, diverged, divergence, first_non_finite
 from headway.experiment.evaluation import episode_rows, evaluate_agent
 from headway.experiment.learners import Fit, Learned, Learner, make_learner
@@ -33,7 +34,6 @@ from headway.experiment.rollouts import (
     Episode,
     PlannerUse,
     Policy,
-    accept,
     random_policy,
 )
 from headway.experiment.tensorboard import write_tensorboard
@@ -168,9 +168,10 @@ class Trainer:
         self.phase(iteration, "collect")
         advance = self.progress.advance
         rollout = resumable_episodes(self.store, "collect", arena, episodes, policy, advance)
-        if len(rollout.broken) > config.collection.max_bad_episodes:
-            self.store.drop("collect")  # for when the environment was mended
-        accept(rollout, config.collection.max_bad_episodes, self.progress.message)
+        allowed, say = config.collection.max_bad_episodes, self.progress.message
+        bad = BadEpisodes("collection.max_bad_episodes", allowed, say, self.store.drop)
+        bad.leave_out("collect", list(rollout.broken.values()))
+        bad.want_some(len(rollout.trajectories))
         return self.keep(iteration, rollout.trajectories), rollout.use.failures
 
     def keep(self, iteration: int, collected: list[Trajectory]) -> list[Trajectory]:
@@ -202,6 +203,7 @@ class Trainer:
                 break
             rollbacks += 1
             self.roll_back(problem, f"epoch {len(history)} of iteration {iteration}", rollbacks)
+            self.store.stop_if_asked()
         return {
             "loss": float(history[-1].loss),
             "forward_loss": float(history[-1].forward_loss),
@@ -254,7 +256,7 @@ class Trainer:
             self.config,
             groups,
             key=key,
-            on_step=self.progress.advance,
+            progress=self.progress,
             store=self.store,
         )
 
@@ -318,13 +320,14 @@ def train_run(
         todo = range(run.finished_iterations, config.collection.num_iterations)
         work = [(i, trainer.amount_of_work(i)) for i in todo]
         shown.schedule([(i, name, total) for i, amounts in work for name, total in amounts.items()])
-        for iteration in todo:
-            try:
-                trainer.run_iteration(iteration)
-            except (BadEnvironmentError, DivergenceError):
-                trainer.store.save()
-                raise
-            stop.answer()
+        with closing(trainer.arena):
+            for iteration in todo:
+                try:
+                    trainer.run_iteration(iteration)
+                except (BadEnvironmentError, DivergenceError):
+                    trainer.store.save()
+                    raise
+                stop.answer()
         run.partial(stop).clear()
     return run
 

@@ -80,13 +80,16 @@ class RunDir:
     def create_or_resume(self, config: Config) -> None:
         """Begin a run here, or make sure that the run here is the same; call it when `locked`.
 
+        What it tolerates of its environments may differ (`settings.TOLERANCE`).
+
         Raises:
             RunError: The directory holds something else, or a run with other settings.
         """
         if self._is_new():
             files.write_bytes(self.path / "config.json", config_file.content(config))
             return
-        found = settings.differences(self.config(), config)
+        begun_with = settings.tolerating_as(self.config(), config)
+        found = settings.differences(begun_with, config)
         if found:
             raise RunError(
                 f"{self.path} holds a run with other settings ({'; '.join(found)}); choose"

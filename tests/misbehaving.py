@@ -1,0 +1,115 @@
+"""An environment that misbehaves when told to. It needs little, so its processes begin quickly."""
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+
+BOX = gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float64)
+
+
+class Drift(gymnasium.Env):
+    """Numbers that drift by the hidden parameter.
+
+    Args:
+        how: The name of a method that is called in the step before `at`; 0 is the reset.
+        at: Which step of an episode.
+        mark: A file; the environment misbehaves only where it makes it.
+        drift: Only environments under this physics misbehave, if given.
+    """
+
+    observation_space = BOX
+    action_space = gymnasium.spaces.Box(-2, 2, (1,), np.float32)
+
+    def __init__(self, how="", at=3, mark="", drift=None):
+        self.how, self.at, self.mark, self.only = how, at, mark, drift
+        self.elapsed = 0
+
+    def set_sim_params(self, values):
+        self.drift = values["drift"]
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.drift = (options or {}).get("sim_params", {}).get("drift", 0.5)
+        self.position = self.np_random.normal(size=3)
+        self.elapsed = 0
+        self.misbehave()
+        return self.position.copy(), {"sim_params": {"drift": self.drift}}
+
+    def step(self, action):
+        self.elapsed += 1
+        self.position += self.drift * self.np_random.normal(size=3)
+        found = self.misbehave()
+        obs, reward = self.position.copy(), float(action[0])
+        return found or (obs, reward, self.elapsed >= 12, False, {})
+
+    def misbehave(self):
+        if not self.how or self.elapsed != self.at or self.only not in (None, self.drift):
+            return None
+        if self.mark:
+            try:
+                Path(self.mark).touch(exist_ok=False)
+            except FileExistsError:
+                return None
+        return getattr(self, self.how)()
+
+    def hang(self):
+        time.sleep(1000)
+
+    def hang_in_c(self):
+        """No Python code can run meanwhile, as in a simulator that waits for ever."""
+        ctypes.PyDLL(None).sleep(1000)
+
+    def hang_with_a_child(self):
+        subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1000)"])
+        self.hang_in_c()
+
+    def crash(self):
+        os.kill(os.getpid(), signal.SIGSEGV)
+
+    def leave(self):
+        os._exit(3)
+
+    def fail(self):
+        raise ZeroDivisionError("a simulator\nfailed")
+
+    def fail_oddly(self):
+        class OddError(Exception):
+            pass
+
+        raise OddError("odd")
+
+    def give_up(self):
+        from headway.errors import BrokenEpisodeError
+
+        raise BrokenEpisodeError("the robot fell apart")
+
+    def end(self):
+        return self.position.copy(), 1.0, True, False, {}
+
+    def cut(self):
+        return self.position.copy(), 1.0, False, True, {}
+
+    def shrink(self):
+        return self.position[:2], 1.0, False, False, {}
+
+    def speak(self):
+        return np.array(["a", "b", "c"]), 1.0, False, False, {}
+
+    def count(self):
+        return np.array([1, 2, 3]), 1, False, False, {}
+
+    def lose_the_reward(self):
+        return self.position.copy(), None, False, False, {}
+
+    def change_spaces(self):
+        self.observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float64)
+
+    def change_actions(self):
+        self.action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
