@@ -94,6 +94,26 @@ class Trainer:
         learned = initial(config, arena.task) if finished == 0 else load_learned(run, config)
         return cls(config, run, arena, learner, learned, buffer, progress, stop)
 
+    def train(self) -> None:
+        """Go through the iterations that are left.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C was pressed; everything is saved.
+            Terminated: SIGTERM was sent; everything is saved.
+        """
+        todo = range(self.run.finished_iterations, self.config.collection.num_iterations)
+        work = [(i, self.amount_of_work(i)) for i in todo]
+        phases = [(i, name, total) for i, amounts in work for name, total in amounts.items()]
+        self.progress.schedule(phases)
+        for iteration in todo:
+            try:
+                self.run_iteration(iteration)
+            except (BadEnvironmentError, DivergenceError):
+                self.store.save()
+                raise
+            self.stop.answer()
+        self.run.partial(self.stop).clear()
+
     @property
     def agent(self) -> Acting:
         """The agent as learned so far."""
@@ -314,18 +334,7 @@ def train_run(
     with progress or Progress() as shown, run.locked(), stop_requests() as stop:
         if resume_from_last_good:
             shown.message(went_back(run.go_back()))
-        trainer = Trainer.open(config, run, shown, stop)
-        todo = range(run.finished_iterations, config.collection.num_iterations)
-        work = [(i, trainer.amount_of_work(i)) for i in todo]
-        shown.schedule([(i, name, total) for i, amounts in work for name, total in amounts.items()])
-        for iteration in todo:
-            try:
-                trainer.run_iteration(iteration)
-            except (BadEnvironmentError, DivergenceError):
-                trainer.store.save()
-                raise
-            stop.answer()
-        run.partial(stop).clear()
+        Trainer.open(config, run, shown, stop).train()
     return run
 
 
