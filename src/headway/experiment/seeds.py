@@ -141,7 +141,11 @@ def _side_by_side(
 
 
 def _ended(begun: Mapping[int, _Begun], meeting: Meeting) -> dict[int, HeadwayError]:
-    """Let the runs go on until each is over; interrupts are left to who asked for them."""
+    """Let the runs go on until each is over; return why some failed.
+
+    Raises:
+        BaseException: What tore one of them out of its work, such as a requested stop.
+    """
     with ThreadPoolExecutor(len(begun), thread_name_prefix="headway-seed") as pool, meeting:
         ended = {seed: pool.submit(run.train) for seed, run in begun.items()}
         wait(ended.values())
@@ -150,7 +154,7 @@ def _ended(begun: Mapping[int, _Begun], meeting: Meeting) -> dict[int, HeadwayEr
         error = future.exception()
         if isinstance(error, HeadwayError):
             failures[seed] = error
-        elif isinstance(error, Exception):
+        elif error is not None:
             raise error
     return failures
 
