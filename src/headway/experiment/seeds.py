@@ -162,8 +162,9 @@ def _ended(begun: Mapping[int, _Begun], meeting: Meeting) -> dict[int, HeadwayEr
 def _failed(failures: Mapping[int, HeadwayError], num_seeds: int) -> SeedsError:
     """Word the error for seeds that failed."""
     reasons = " ".join(f"seed {seed}: {error}" for seed, error in failures.items())
+    others = "" if len(failures) == num_seeds else ", the others are finished"
     return SeedsError(
-        f"{len(failures)} of {num_seeds} seeds stopped, the others are finished; the same command"
-        f" goes on with what is missing. {reasons}",
+        f"{len(failures)} of {num_seeds} seeds stopped{others}; the same command goes on with what"
+        f" is missing. {reasons}",
         dict(failures),
     )

@@ -88,7 +88,7 @@ class Trainer:
         run.check()
         run.tidy()
         buffer = ReplayBuffer(arena.task.obs_size, arena.task.action_size)
-        for trajectory in run.load_data():
+        for trajectory in run.load_data() if learner.learns else ():
             buffer.add(trajectory)
         finished = run.finished_iterations
         learned = initial(config, arena.task) if finished == 0 else load_learned(run, config)

@@ -267,16 +267,24 @@ class _Stacks:
         return results
 
 
-@eqx.filter_jit
 def _stack(trees: Sequence[Any]) -> Any:
-    def of_leaf(*leaves: Any) -> Any:
-        return jnp.stack(leaves) if eqx.is_array(leaves[0]) else leaves[0]
+    """One tree of longer arrays; what is no array is the same in all of them."""
+    fixed = eqx.filter(trees[0], eqx.is_array, inverse=True)
+    return eqx.combine(_stack_arrays([eqx.filter(tree, eqx.is_array) for tree in trees]), fixed)
 
-    return jax.tree.map(of_leaf, *trees)
+
+@jax.jit
+def _stack_arrays(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 
-@eqx.filter_jit
 def _take_apart(stacked: Any, number: int) -> list[Any]:
-    return [
-        jax.tree.map(lambda x, i=i: x[i] if eqx.is_array(x) else x, stacked) for i in range(number)
-    ]
+    """The trees that were stacked."""
+    fixed = eqx.filter(stacked, eqx.is_array, inverse=True)
+    parts = _rows(eqx.filter(stacked, eqx.is_array), number)
+    return [eqx.combine(part, fixed) for part in parts]
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _rows(stacked: Any, number: int) -> list[Any]:
+    return [jax.tree.map(lambda x, i=i: x[i], stacked) for i in range(number)]
