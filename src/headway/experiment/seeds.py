@@ -6,7 +6,7 @@ the runs meet where networks are fitted and where they plan (`models.meeting`).
 
 import contextlib
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import NamedTuple
@@ -23,6 +23,14 @@ from headway.experiment.training import Trainer, train_run
 from headway.models.meeting import Meeting, Seat
 from headway.storage.interrupts import stop_requests
 from headway.storage.run_dir import RunDir
+
+
+class _Job(NamedTuple):
+    """A run to be made."""
+
+    config: Config
+    run: RunDir
+    own: Progress | None
 
 
 class _Begun(NamedTuple):
@@ -47,6 +55,7 @@ def train_seeds(
     run_dirs: Mapping[int, str | Path],
     progress: Progress | None = None,
     *,
+    of_seed: Mapping[int, Progress] | None = None,
     resume_from_last_good: bool = False,
     ignore_limits: bool = False,
 ) -> list[RunDir]:
@@ -63,6 +72,7 @@ def train_seeds(
         config: All settings; its own seed does not matter.
         run_dirs: A directory for each seed, new or with the same settings.
         progress: Shows where the run is that is least far; silent by default.
+        of_seed: For each seed, what is told of its run alone; silent by default.
         resume_from_last_good: Where a file is damaged, forget the iterations that stand on it.
         ignore_limits: Try what seems too large for the free memory.
 
@@ -73,14 +83,17 @@ def train_seeds(
         SeedsError: Some seeds failed, and the others are finished.
     """
     _check(config, run_dirs)
-    configs = {seed: dataclasses.replace(config, seed=seed) for seed in run_dirs}
+    jobs = [
+        _Job(dataclasses.replace(config, seed=seed), RunDir(path), (of_seed or {}).get(seed))
+        for seed, path in run_dirs.items()
+    ]
     options = {"resume_from_last_good": resume_from_last_good, "ignore_limits": ignore_limits}
     learns = learner_of(config, load_task(config)).learns
     train = _side_by_side if learns else _one_after_another
-    failures = train(configs, run_dirs, progress or Progress(), options)
+    failures = train(jobs, progress or Progress(), options)
     if failures:
-        raise _failed(failures, len(configs))
-    return [RunDir(path) for path in run_dirs.values()]
+        raise _failed(failures, len(jobs))
+    return [job.run for job in jobs]
 
 
 def _check(config: Config, run_dirs: Mapping[int, str | Path]) -> None:
@@ -100,43 +113,36 @@ def _check(config: Config, run_dirs: Mapping[int, str | Path]) -> None:
 
 
 def _one_after_another(
-    configs: Mapping[int, Config],
-    run_dirs: Mapping[int, str | Path],
-    progress: Progress,
-    options: Mapping[str, bool],
+    jobs: Sequence[_Job], progress: Progress, options: Mapping[str, bool]
 ) -> dict[int, HeadwayError]:
     """Make runs that have no networks, and thus nothing to compute together."""
     failures = {}
-    for seed, config in configs.items():
-        progress.message(f"seed {seed} by itself, because {config.method} learns nothing")
+    for config, run, own in jobs:
+        progress.message(f"seed {config.seed} by itself, because {config.method} learns nothing")
         try:
-            train_run(config, run_dirs[seed], progress, **options)
+            train_run(config, run.path, own or progress, **options)
         except HeadwayError as error:
-            failures[seed] = error
+            failures[config.seed] = error
     return failures
 
 
 def _side_by_side(
-    configs: Mapping[int, Config],
-    run_dirs: Mapping[int, str | Path],
-    progress: Progress,
-    options: Mapping[str, bool],
+    jobs: Sequence[_Job], progress: Progress, options: Mapping[str, bool]
 ) -> dict[int, HeadwayError]:
     """Train every run in a thread of its own; return why some failed."""
-    runs = {seed: RunDir(path) for seed, path in run_dirs.items()}
     if not options["ignore_limits"]:
-        check_memory(need_of(next(iter(configs.values()))).times(len(configs)))
+        check_memory(need_of(jobs[0].config).times(len(jobs)))
     with progress as shown, contextlib.ExitStack() as locks:
-        for run in runs.values():
-            locks.enter_context(run.locked())
+        for job in jobs:
+            locks.enter_context(job.run.locked())
         with stop_requests() as stop:
             meeting, shared, begun = Meeting(), SharedProgress(shown), {}
-            for seed, run in runs.items():
+            for config, run, own in jobs:
                 seat = meeting.take_seat()
-                told = shared.of_run(seed, seat.move)
+                told = shared.of_run(config.seed, seat.move, own)
                 if options["resume_from_last_good"]:
                     told.message(went_back(run.go_back()))
-                begun[seed] = _Begun(Trainer.open(configs[seed], run, told, stop), told, seat)
+                begun[config.seed] = _Begun(Trainer.open(config, run, told, stop), told, seat)
             return _ended(begun, meeting)
 
 

@@ -19,13 +19,15 @@ Place = tuple[int, int]
 class SharedProgress:
     """Shows where the run is that is least far, with the work of all runs.
 
+    Runs are in threads of their own, and tell of themselves while they hold the `lock`.
+
     Args:
         shown: The display.
     """
 
     def __init__(self, shown: Progress):
+        self.lock = threading.RLock()
         self._shown = shown
-        self._lock = threading.RLock()
         self._runs: list[RunProgress] = []
         self._totals: dict[Place, int] = defaultdict(int)
         self._done: dict[Place, int] = defaultdict(int)
@@ -33,53 +35,51 @@ class SharedProgress:
         self._now: Place | None = None
         self._announced = False
 
-    def of_run(self, seed: int, on_phase: Callable[[Place], None]) -> "RunProgress":
+    def of_run(
+        self, seed: int, on_phase: Callable[[Place], None], own: Progress | None = None
+    ) -> "RunProgress":
         """What one run tells its progress to.
 
         Args:
             seed: Of the run; names it in messages.
             on_phase: Called when the run begins a phase.
+            own: Is told all of this run, and of no other.
         """
-        run = RunProgress(self, seed, on_phase)
+        run = RunProgress(self, seed, on_phase, own or Progress())
         self._runs.append(run)
         return run
 
     def schedule(self, run: "RunProgress", phases: Sequence[Phase]) -> None:
         """Add the phases of a run; when all have told theirs, they are announced."""
-        with self._lock:
-            run.iterations = {iteration for iteration, _, _ in phases}
-            for iteration, name, total in phases:
-                self._totals[iteration, PHASES.index(name)] += total
+        run.iterations = {iteration for iteration, _, _ in phases}
+        for iteration, name, total in phases:
+            self._totals[iteration, PHASES.index(name)] += total
 
     def phase(self, run: "RunProgress", place: Place, num_iterations: int) -> None:
         """Begin a phase, once the last run has come to it."""
-        with self._lock:
-            run.place, run.num_iterations = place, num_iterations
-            self._catch_up()
+        run.place, run.num_iterations = place, num_iterations
+        self._catch_up()
 
     def advance(self, run: "RunProgress", amount: int, values: Mapping[str, float]) -> None:
         """Count work; that of runs which are ahead is shown later."""
-        with self._lock:
-            self._done[run.place] += amount
-            run.values.update(values)
-            if run.place == self._now:
-                self._shown.advance(amount, **self._mean_values(values))
+        self._done[run.place] += amount
+        run.values.update(values)
+        if run.place == self._now:
+            self._shown.advance(amount, **self._mean_values(values))
 
     def iteration_done(self, run: "RunProgress", metrics: Mapping[str, Any]) -> None:
         """Tell what the runs measured, once the last of them has finished the iteration."""
-        with self._lock:
-            run.iterations.discard(metrics["iteration"])
-            self._finished[metrics["iteration"]].append(metrics)
-            self._tell_finished()
+        run.iterations.discard(metrics["iteration"])
+        self._finished[metrics["iteration"]].append(metrics)
+        self._tell_finished()
 
     def message(self, text: str) -> None:
         """Say something."""
-        with self._lock:
-            self._shown.message(text)
+        self._shown.message(text)
 
     def leave(self, run: "RunProgress") -> None:
         """Wait no longer for a run."""
-        with self._lock:
+        with self.lock:
             self._runs.remove(run)
             self._tell_finished()
             self._catch_up()
@@ -116,12 +116,18 @@ class SharedProgress:
 class RunProgress(Progress):
     """What one of several runs tells its progress to; leave it when the run ends."""
 
-    def __init__(self, shared: SharedProgress, seed: int, on_phase: Callable[[Place], None]):
+    def __init__(
+        self,
+        shared: SharedProgress,
+        seed: int,
+        on_phase: Callable[[Place], None],
+        own: Progress,
+    ):
         self.place: Place = (-1, 0)
         self.num_iterations = 0
         self.iterations: set[int] = set()
         self.values: dict[str, float] = {}
-        self._shared, self._seed, self._on_phase = shared, seed, on_phase
+        self._shared, self._seed, self._on_phase, self._own = shared, seed, on_phase, own
 
     def __exit__(self, kind, error, trace) -> None:
         """Leave."""
@@ -129,26 +135,35 @@ class RunProgress(Progress):
 
     def schedule(self, phases: Sequence[Phase]) -> None:
         """See `Progress.schedule`."""
-        self._shared.schedule(self, phases)
+        with self._shared.lock:
+            self._own.schedule(phases)
+            self._shared.schedule(self, phases)
 
     def phase(self, iteration: int, num_iterations: int, name: str, total: int) -> None:
         """See `Progress.phase`."""
-        del total  # it was announced
         place = iteration, PHASES.index(name)
-        self._shared.phase(self, place, num_iterations)
+        with self._shared.lock:
+            self._own.phase(iteration, num_iterations, name, total)
+            self._shared.phase(self, place, num_iterations)
         self._on_phase(place)
 
     def advance(self, amount: int = 1, **values: float) -> None:
         """See `Progress.advance`."""
-        self._shared.advance(self, amount, values)
+        with self._shared.lock:
+            self._own.advance(amount, **values)
+            self._shared.advance(self, amount, values)
 
     def iteration_done(self, metrics: Mapping[str, Any]) -> None:
         """See `Progress.iteration_done`."""
-        self._shared.iteration_done(self, metrics)
+        with self._shared.lock:
+            self._own.iteration_done(metrics)
+            self._shared.iteration_done(self, metrics)
 
     def message(self, text: str) -> None:
         """See `Progress.message`; the seed is named."""
-        self._shared.message(f"seed {self._seed}: {text}")
+        with self._shared.lock:
+            self._own.message(text)
+            self._shared.message(f"seed {self._seed}: {text}")
 
 
 def pooled(metrics: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -42,7 +42,6 @@ def jit_networks(function: Callable, *, precision: str = "float32") -> Callable:
     The function is wrapped when first called, so that importing stays light. In a run that goes
     side by side with others, it is called for all of them at once (`models.meeting`).
     """
-
     program = Program(function, lambda: {"compiler_options": compiler_options(precision)})
 
     @functools.wraps(function)
