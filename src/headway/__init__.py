@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from headway.api import evaluate as evaluate
     from headway.api import load as load
     from headway.api import train as train
+    from headway.api import train_seeds as train_seeds
     from headway.config import Config as Config
     from headway.data import ReplayBuffer as ReplayBuffer
     from headway.data import Trajectory as Trajectory
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from headway.errors import HeadwayError as HeadwayError
     from headway.errors import LimitError as LimitError
     from headway.errors import RunError as RunError
+    from headway.errors import SeedsError as SeedsError
     from headway.errors import UnknownNameError as UnknownNameError
     from headway.experiment.methods import METHODS as METHODS
     from headway.experiment.methods import PRESETS as PRESETS
@@ -54,7 +56,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "api": ("Evaluation", "Run", "evaluate", "load", "train"),
+    "api": ("Evaluation", "Run", "evaluate", "load", "train", "train_seeds"),
     "config": ("Config",),
     "data": ("ReplayBuffer", "Trajectory"),
     "errors": (
@@ -65,6 +67,7 @@ _HOME = {
         "HeadwayError",
         "LimitError",
         "RunError",
+        "SeedsError",
         "UnknownNameError",
     ),
     "experiment.methods": ("METHODS", "PRESETS", "make_config"),

@@ -6,7 +6,7 @@ import fakes
 import pytest
 from rich.console import Console
 
-from headway.errors import ConfigError
+from headway.errors import ConfigError, SeedsError
 from headway.experiment.loading import load_task
 from headway.planning.flop import plan_flop
 from headway.storage.run_lock import locked
@@ -103,8 +103,50 @@ def test_without_ray_it_says_what_to_install(training, tmp_path, monkeypatch):
         run_jobs([fakes.tiny_job(tmp_path, 2)], Workers(address="auto"), board)
 
 
+def test_seeds_of_a_configuration_are_trained_together(training, tmp_path, monkeypatch):
+    groups = []
+
+    def together(config, places, *, of_seed):
+        groups.append((config.planner.horizon, tuple(places)))
+        for seed in places:
+            if seed != 1:
+                job = next(job for job in jobs if job.path == places[seed])
+                fakes.write_run(job.config, job.path, of_seed[seed])
+        raise SeedsError("one stopped", {1: fakes.DIVERGED})
+
+    monkeypatch.setattr(running, "train_seeds", together)
+    horizons = [{}, {"planner.horizon": 2}]
+    jobs = [fakes.tiny_job(tmp_path, seed, **h) for seed in (0, 1, 2) for h in horizons]
+    jobs = jobs[:5]  # the second configuration has seeds 0 and 1 only
+    board = fakes.Remembering()
+    run_jobs(jobs, Workers(seeds_together=True), board)
+    assert groups == [(3, (0, 1, 2)), (2, (0, 1))]
+    assert training.calls == []
+    assert board.failures == {jobs[2].path: "no finite number", jobs[3].path: "no finite number"}
+    assert all(board.statuses[jobs[i].path].state == "done" for i in (0, 1, 4))
+    assert board.statuses[jobs[4].path].returns == "collected 43 ± 1"
+
+
+def test_seeds_that_cannot_be_begun_together_go_one_by_one(training, tmp_path, monkeypatch):
+    def together(*args, **options):
+        raise fakes.BUSY
+
+    monkeypatch.setattr(running, "train_seeds", together)
+    jobs = [fakes.tiny_job(tmp_path, seed) for seed in (0, 1)]
+    board = fakes.Remembering()
+    run_jobs(jobs, Workers(seeds_together=True), board)
+    assert [seed for _, seed in training.calls] == [0, 1]
+    assert board.messages == [f"each seed by itself, because {fakes.BUSY}"]
+
+
 @pytest.mark.parametrize(
-    "wrong", [{"cpus_per_run": 0}, {"gpus_per_run": -1}, {"one_by_one": True, "address": "auto"}]
+    "wrong",
+    [
+        {"cpus_per_run": 0},
+        {"gpus_per_run": -1},
+        {"one_by_one": True, "address": "auto"},
+        {"seeds_together": True, "address": "auto"},
+    ],
 )
 def test_impossible_workers_are_refused(wrong):
     with pytest.raises(ConfigError, match=r"allowed|leave one out"):

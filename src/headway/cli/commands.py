@@ -19,11 +19,13 @@ from headway.cli.defaults import parse_for_run, parse_twice
 from headway.cli.output import print_json as _print_json
 from headway.cli.output import print_tables as _print_tables
 from headway.cli.reports import diagnose, record, report
+from headway.cli.seeds import read_seeds
 from headway.cli.usage import UsageError, parse
 from headway.config import Config
 from headway.errors import ConfigError, unknown_name
 
 if TYPE_CHECKING:
+    from headway.api import Run
     from headway.experiment.evaluation import PlanningCost
     from headway.storage.tables import EpisodeRow
     from headway.tasks.catalog import EnvSpec
@@ -34,46 +36,62 @@ MAX_SIM_PARAMS_BYTES = 2**20
 def train(words: Sequence[str]) -> int:
     """`headway train`."""
     arguments, settings = parse_train(words)
+    runs = _train(arguments, settings)
+    if arguments.json:
+        facts = list(map(_facts, runs))
+        return _print_json({"runs": facts} if arguments.seeds else facts[0])
+    config, seeds = runs[0].config, ", ".join(str(run.config.seed) for run in runs)
+    title = f"{config.env}, {config.method} after {len(runs[0].metrics)} iterations"
+    rows = [row for run in runs for row in _last_rows(run)]
+    _print_evaluation(rows, f"{title}, seeds {seeds}" if arguments.seeds else title)
+    again = "The command, which resumes what was interrupted"
+    for heading, lines in (
+        ("Figures", [str(path) for run in runs for path in run.figures]),
+        ("Test it again", [shlex.join(["headway", "evaluate", str(run.path)]) for run in runs]),
+        (again, [shlex.join(["headway", "train", *words])]),
+    ):
+        print(f"{heading}:", *lines, sep="\n  ")
+    return 0
+
+
+def _train(arguments: Train, settings: dict[str, Any]) -> "list[Run]":
     from headway import api
     from headway.experiment.progress import make_progress
 
-    run = api.train(
-        arguments.env,
-        method=arguments.method,
-        preset=arguments.preset,
-        seed=arguments.seed,
-        run_dir=arguments.run_dir,
-        settings=settings,
-        progress=make_progress(arguments.quiet),
-        resume_from_last_good=arguments.resume_from_last_good,
-        ignore_limits=arguments.ignore_limits,
-    )
+    if arguments.seed and arguments.seeds:
+        raise UsageError("--seed and --seeds are given, allowed: one of them.")
+    options: dict[str, Any] = {
+        "method": arguments.method,
+        "preset": arguments.preset,
+        "run_dir": arguments.run_dir,
+        "settings": settings,
+        "progress": make_progress(arguments.quiet),
+        "resume_from_last_good": arguments.resume_from_last_good,
+        "ignore_limits": arguments.ignore_limits,
+    }
+    if arguments.seeds:
+        return api.train_seeds(arguments.env, seeds=read_seeds(arguments.seeds), **options)
+    return [api.train(arguments.env, seed=arguments.seed, **options)]
+
+
+def _last_rows(run: "Run") -> "list[EpisodeRow]":
+    """The test episodes of a run's last iteration."""
     last = max((row.iteration for row in run.evaluation), default=0)
-    rows = [row for row in run.evaluation if row.iteration == last]
-    if arguments.json:
-        facts = {
-            "run_dir": str(run.path),
-            "env": run.config.env,
-            "method": run.config.method,
-            "preset": run.config.preset,
-            "seed": run.config.seed,
-            "iterations": len(run.metrics),
-            "timesteps": run.metrics[-1]["timesteps"],
-            **_results(rows),
-            "figures": [str(path) for path in run.figures],
-        }
-        return _print_json(facts)
-    _print_evaluation(rows, f"{run.config.env}, {run.config.method} after {last + 1} iterations")
-    for title, lines in (
-        ("Figures", [str(path) for path in run.figures]),
-        ("Test it again", [shlex.join(["headway", "evaluate", str(run.path)])]),
-        (
-            "The command, which resumes what was interrupted",
-            [shlex.join(["headway", "train", *words])],
-        ),
-    ):
-        print(f"{title}:", *lines, sep="\n  ")
-    return 0
+    return [row for row in run.evaluation if row.iteration == last]
+
+
+def _facts(run: "Run") -> dict[str, Any]:
+    return {
+        "run_dir": str(run.path),
+        "env": run.config.env,
+        "method": run.config.method,
+        "preset": run.config.preset,
+        "seed": run.config.seed,
+        "iterations": len(run.metrics),
+        "timesteps": run.metrics[-1]["timesteps"],
+        **_results(_last_rows(run)),
+        "figures": [str(path) for path in run.figures],
+    }
 
 
 def evaluate(words: Sequence[str]) -> int:

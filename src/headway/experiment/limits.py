@@ -42,6 +42,11 @@ class MemoryNeed(NamedTuple):
         """Fitting and planning are never at the same time."""
         return self.process + self.model + self.data + max(self.fitting, self.planning)
 
+    def times(self, num_runs: int) -> "MemoryNeed":
+        """What several runs need that go side by side in one process."""
+        of_each = {n: num_runs * value for n, value in self._asdict().items() if n != "process"}
+        return self._replace(**of_each)
+
     @property
     def to_load(self) -> "MemoryNeed":
         """What is needed when the model is only read."""

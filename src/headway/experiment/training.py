@@ -88,11 +88,31 @@ class Trainer:
         run.check()
         run.tidy()
         buffer = ReplayBuffer(arena.task.obs_size, arena.task.action_size)
-        for trajectory in run.load_data():
+        for trajectory in run.load_data() if learner.learns else ():
             buffer.add(trajectory)
         finished = run.finished_iterations
         learned = initial(config, arena.task) if finished == 0 else load_learned(run, config)
         return cls(config, run, arena, learner, learned, buffer, progress, stop)
+
+    def train(self) -> None:
+        """Go through the iterations that are left.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C was pressed; everything is saved.
+            Terminated: SIGTERM was sent; everything is saved.
+        """
+        todo = range(self.run.finished_iterations, self.config.collection.num_iterations)
+        work = [(i, self.amount_of_work(i)) for i in todo]
+        phases = [(i, name, total) for i, amounts in work for name, total in amounts.items()]
+        self.progress.schedule(phases)
+        for iteration in todo:
+            try:
+                self.run_iteration(iteration)
+            except (BadEnvironmentError, DivergenceError):
+                self.store.save()
+                raise
+            self.stop.answer()
+        self.run.partial(self.stop).clear()
 
     @property
     def agent(self) -> Acting:
@@ -317,18 +337,8 @@ def train_run(
         if resume_from_last_good:
             shown.message(went_back(run.go_back()))
         trainer = Trainer.open(config, run, shown, stop)
-        todo = range(run.finished_iterations, config.collection.num_iterations)
-        work = [(i, trainer.amount_of_work(i)) for i in todo]
-        shown.schedule([(i, name, total) for i, amounts in work for name, total in amounts.items()])
         with closing(trainer.arena):
-            for iteration in todo:
-                try:
-                    trainer.run_iteration(iteration)
-                except (BadEnvironmentError, DivergenceError):
-                    trainer.store.save()
-                    raise
-                stop.answer()
-        run.partial(stop).clear()
+            trainer.train()
     return run
 
 

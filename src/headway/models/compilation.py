@@ -4,9 +4,10 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import platformdirs
+
+from headway.models.meeting import Program, seat_here
 
 # Found by measuring on CPUs (docs/performance.md): full-width vectors make the activations
 # faster, and YNNPACK's fusions slow float32 products down but are the only way to fast
@@ -38,17 +39,17 @@ def compiler_options(precision: str = "float32") -> dict[str, Any]:
 def jit_networks(function: Callable, *, precision: str = "float32") -> Callable:
     """`equinox.filter_jit` with the compiler options for many small products.
 
-    The function is wrapped when first called, so that importing stays light.
+    The function is wrapped when first called, so that importing stays light. In a run that goes
+    side by side with others, it is called for all of them at once (`models.meeting`).
     """
-
-    @functools.cache
-    def compiled() -> Callable:
-        options: dict[str, Any] = {"compiler_options": compiler_options(precision)}
-        return eqx.filter_jit(function, **options)
+    program = Program(function, lambda: {"compiler_options": compiler_options(precision)})
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        return compiled()(*args, **kwargs)
+        seat = seat_here()
+        if seat is None:
+            return program.alone(*args, **kwargs)
+        return seat.compute(program, args, kwargs)
 
     return call
 

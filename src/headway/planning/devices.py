@@ -10,6 +10,8 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 
+from headway.models.meeting import seeds_at_once
+
 Tree = TypeVar("Tree")
 Devices = Literal["local", "all"]
 
@@ -24,12 +26,12 @@ def environments_at_once(num_envs: int, bytes_per_env: int) -> int:
 
     Args:
         num_envs: Environments in all.
-        bytes_per_env: Size of one environment's widest array of activations.
+        bytes_per_env: Size of one environment's widest array of activations, for one seed.
 
     Returns:
         At least 1; the environments are spread evenly over the fewest chunks that fit.
     """
-    fitting = max(1, activation_budget() // bytes_per_env)
+    fitting = max(1, activation_budget() // (bytes_per_env * seeds_at_once()))
     chunks = -(-num_envs // fitting)
     return -(-num_envs // chunks)
 

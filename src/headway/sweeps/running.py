@@ -1,11 +1,17 @@
-"""Making the runs that are missing: one after another here, or side by side on Ray."""
+"""Making the runs that are missing: one after another here, or side by side on Ray.
+
+Here, the seeds of one configuration may also be trained together, in one program.
+"""
 
 import dataclasses
+import functools
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
+from pathlib import Path
 
-from headway.errors import BusyError, ConfigError, HeadwayError
+from headway.errors import BusyError, ConfigError, HeadwayError, SeedsError
+from headway.experiment.seeds import train_seeds
 from headway.experiment.training import train_run
 from headway.sweeps.board import Board
 from headway.sweeps.jobs import Job
@@ -27,6 +33,8 @@ class Workers:
     """Cores that one run reserves, and threads that it computes with."""
     gpus_per_run: float | None = None
     """GPUs, or a fraction of one, that one run reserves; None takes one where there are any."""
+    seeds_together: bool = False
+    """Whether the seeds of a configuration are trained in one program, in this process."""
 
     def __post_init__(self):
         gpus = 0.0 if self.gpus_per_run is None else self.gpus_per_run
@@ -35,10 +43,11 @@ class Workers:
                 f"cpus_per_run is {self.cpus_per_run} and gpus_per_run {self.gpus_per_run},"
                 " allowed: more than 0 cores, and 0 or more GPUs."
             )
-        if self.one_by_one and self.address:
-            raise ConfigError(
-                f"one_by_one takes no Ray cluster, got address {self.address!r}; leave one out."
-            )
+        for name in ("one_by_one", "seeds_together"):
+            if getattr(self, name) and self.address:
+                raise ConfigError(
+                    f"{name} takes no Ray cluster, got address {self.address!r}; leave one out."
+                )
 
 
 def run_jobs(jobs: Sequence[Job], workers: Workers, board: Board) -> None:
@@ -53,12 +62,14 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, board: Board) -> None:
     missing = [job for job in jobs if not board.statuses[job.path].over]
     if not missing:
         return
-    if workers.one_by_one or not ray_is_installed():
+    if workers.seeds_together:
+        run_here(missing, board, seeds_together=True)
+    elif workers.one_by_one or not ray_is_installed():
         if workers.address:
             raise ConfigError(f"a Ray cluster needs Ray, which is missing; {INSTALL_RAY}.")
         if not workers.one_by_one and len(missing) > 1:
             board.message(f"runs go one after another; {INSTALL_RAY} lets them go side by side")
-        run_one_by_one(missing, board)
+        run_here(missing, board)
     else:
         from headway.sweeps.on_ray import run_on_ray
 
@@ -70,15 +81,56 @@ def ray_is_installed() -> bool:
     return find_spec("ray") is not None
 
 
-def run_one_by_one(jobs: Sequence[Job], board: Board) -> None:
-    """Make runs in this process, in their order; those that another process holds come last."""
+def run_here(jobs: Sequence[Job], board: Board, *, seeds_together: bool = False) -> None:
+    """Make runs in this process, in their order; those that another process holds come last.
+
+    Args:
+        jobs: The runs.
+        board: Takes reports.
+        seeds_together: Train runs that differ in nothing but the seed in one program.
+    """
     waiting = list(jobs)
     while waiting:
-        for job in waiting:
-            board.tell(job, make_run(job, lambda status, job=job: board.tell(job, status)))
+        for group in seeds_of_each(waiting) if seeds_together else [[job] for job in waiting]:
+            make_together(group, board)
         waiting = [job for job in waiting if not board.statuses[job.path].over]
         if waiting:
             time.sleep(PATIENCE)
+
+
+def seeds_of_each(jobs: Sequence[Job]) -> list[list[Job]]:
+    """The jobs of each configuration; these lie in one folder."""
+    groups: dict[Path, list[Job]] = {}
+    for job in jobs:
+        groups.setdefault(job.path.parent, []).append(job)
+    return list(groups.values())
+
+
+def make_together(jobs: Sequence[Job], board: Board) -> None:
+    """Train runs that differ in nothing but the seed, each to its end or its own failure."""
+    failures: Mapping[int, HeadwayError] = {}
+    if len(jobs) > 1:
+        told = {
+            job.config.seed: StatusProgress(
+                functools.partial(board.tell, job), job.finished_iterations
+            )
+            for job in jobs
+        }
+        places = {job.config.seed: job.path for job in jobs}
+        try:
+            train_seeds(jobs[0].config, places, of_seed=told)
+        except SeedsError as error:
+            failures = error.failures
+        except HeadwayError as error:  # none has begun
+            board.message(f"each seed by itself, because {error}")
+    for job in jobs:  # what is finished by now is not made again
+        reason = failures.get(job.config.seed)
+        if reason is None:
+            ended = make_run(job, functools.partial(board.tell, job))
+        else:
+            ended = Status("failed", job.finished_iterations, note=str(reason))
+        returns = ended.returns or board.statuses[job.path].returns
+        board.tell(job, dataclasses.replace(ended, returns=returns))
 
 
 def make_run(job: Job, tell: Tell) -> Status:
