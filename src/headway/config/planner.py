@@ -1,0 +1,131 @@
+"""Settings of the planner."""
+
+import dataclasses
+import typing
+from typing import Literal
+
+from headway.problems import Problems
+
+OptimizerName = Literal["cem", "icem", "mppi", "random-shooting"]
+HeadSelection = Literal["adaptive", "average", "random", "evidence", "evidence-sampled"]
+Adaptation = Literal["none", "last-layer"]
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannerConfig:
+    """How actions are chosen with the model (supplement A.2; fact sheet C)."""
+
+    optimizer: OptimizerName = "cem"
+    """What searches for the best action sequence; settings below name those they matter to."""
+    horizon: int = 30
+    """Imagined steps."""
+    num_candidates: int = 200
+    """Action sequences drawn per optimizer iteration; in the first one with iCEM."""
+    num_elites: int = 50
+    """Best candidates that shape the next iteration (CEM; iCEM, whose paper takes 10)."""
+    num_iterations: int = 5
+    """Optimizer iterations per plan; random shooting draws new candidates in each."""
+    smoothing: float = 0.1
+    """Share of the old mean and spread that is kept at each iteration (CEM, iCEM)."""
+    initial_std: float = 0.5
+    """Standard deviation of the first candidates, actions being scaled to [-1, 1] (CEM, iCEM);
+    of all candidates (MPPI)."""
+    warm_variance: bool = False
+    """Whether to start from the variance of the last plan, shifted by one step as its mean is
+    (CEM)."""
+    warm_min_std: float = 0.1
+    """Least standard deviation to start from with `warm_variance` (CEM)."""
+    settle_tolerance: float = 0.0
+    """A search ends early where an iteration moved the mean by less than this, root mean square
+    over the plan, actions being scaled to [-1, 1]; 0 never does (CEM)."""
+    noise_beta: float = 2.0
+    """Exponent of the noise's power spectrum over the horizon: 0 white, 1 pink, 2 red; smoother
+    for slow systems (iCEM, MPPI)."""
+    population_decay: float = 1.25
+    """Factor by which each iteration draws fewer candidates, down to twice the elites (iCEM)."""
+    kept_elite_fraction: float = 0.3
+    """Share of the elites that competes again in the next iteration and at the next step (iCEM)."""
+    temperature: float = 0.5
+    """Softness of the weights exp(return / temperature), the returns of an iteration being
+    standardised: less looks at the best candidates only (MPPI)."""
+    num_particles: int = 20
+    """Imagined rollouts per candidate; a multiple of `model.num_members`."""
+    particle_noise: Literal["independent", "shared"] = "independent"
+    """Whether every candidate draws its own noise, or all share that of their particles: faster,
+    and candidates are compared under equal luck."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """What the networks multiply while planning; sums and states are always float32."""
+    devices: Literal["local", "all"] = "local"
+    """Which devices share the candidates: those of this process, or of all processes that
+    `jax.distributed` joins, which must then all act alike, step by step."""
+    head_selection: HeadSelection = "adaptive"
+    """Which head plans: the best on recent transitions, their average, or a random one; the most
+    likely one given all transitions, of which those older than `selection_length` hardly count
+    (`evidence`), or one drawn by each member with that probability (`evidence-sampled`)."""
+    selection_length: int = 10
+    """Past transitions on which heads compete (N)."""
+    selection_error: Literal["mean", "sampled", "corrected"] = "mean"
+    """Error of the predicted mean in normalised units, or (released code) of samples in raw
+    units; or of the mean with what the head has learned in the episode (last-layer)."""
+    selection_skips_newest: bool = False
+    """Whether the newest transition is not used to select heads (released code)."""
+    reward: Literal["task", "released"] = "task"
+    """The environment's own reward, or the one that the released code plans with."""
+    adaptation: Adaptation = "none"
+    """Whether heads keep learning while they act: `last-layer` corrects their means by Bayesian
+    regression on the episode so far. Its prior comes from the training data."""
+    adaptation_noise: Literal["constant", "heads"] = "constant"
+    """Noise of the transitions that are learned from: the same for all, or in proportion to what
+    each head's own variance says (last-layer)."""
+    adaptation_prior: Literal["owner", "runner-up"] = "owner"
+    """Which head's residuals on the training episodes the prior is fitted to: those of the head
+    that explains an episode best, or second best, as if it were of unseen physics (last-layer)."""
+    adaptation_variance: bool = False
+    """Whether the uncertainty of what was learned adds to the noise of imagined steps (last-layer);
+    costs one more hidden layer."""
+    forgetting: float = 0.0
+    """Share of the uncertainty before the episode that comes back at every step, so that old
+    transitions count less; 0 never forgets (last-layer)."""
+    change_threshold: float = 0.0
+    """Log Bayes factor for changed physics above which all that was learned is dropped; 0 never
+    does (last-layer)."""
+    risk_aversion: float = 0.0
+    """Candidates are ranked by the mean return minus this many standard deviations over their
+    particles."""
+
+    def __post_init__(self):
+        problems = Problems(self)
+        problems.at_least(
+            1, "horizon", "num_candidates", "num_elites", "num_iterations", "num_particles"
+        )
+        problems.at_least(1, "selection_length")
+        problems.between(0.0, 1.0, "smoothing")
+        problems.between(1e-6, 10.0, "initial_std", "warm_min_std")
+        problems.at_least(0, "settle_tolerance")
+        problems.between(0.0, 10.0, "noise_beta")
+        problems.at_least(1, "population_decay")
+        problems.between(0.0, 1.0, "kept_elite_fraction")
+        problems.between(1e-6, 1e6, "temperature")
+        problems.one_of("optimizer", typing.get_args(OptimizerName))
+        problems.one_of("head_selection", typing.get_args(HeadSelection))
+        problems.one_of("selection_error", ("mean", "sampled", "corrected"))
+        problems.one_of("reward", ("task", "released"))
+        problems.one_of("particle_noise", ("independent", "shared"))
+        problems.one_of("precision", ("float32", "bfloat16"))
+        problems.one_of("devices", ("local", "all"))
+        problems.one_of("adaptation", typing.get_args(Adaptation))
+        problems.one_of("adaptation_noise", ("constant", "heads"))
+        problems.one_of("adaptation_prior", ("owner", "runner-up"))
+        problems.between(0.0, 0.99, "forgetting")
+        problems.at_least(0, "change_threshold", "risk_aversion")
+        share = {"icem": 2, "mppi": 0, "random-shooting": 0}.get(self.optimizer, 1)
+        problems.require(
+            share * self.num_elites <= self.num_candidates,
+            f"num_elites is {self.num_elites}, allowed: at most {'half of ' * (share == 2)}"
+            f"num_candidates ({self.num_candidates})",
+        )
+        problems.require(
+            not (self.selection_skips_newest and self.selection_length == 1),
+            "selection_skips_newest leaves nothing of a selection_length of 1, allowed: 2 or more",
+        )
+        problems.report()
