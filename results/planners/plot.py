@@ -67,10 +67,16 @@ def is_extended(planner: str) -> bool:
     return "warm" in planner or "settle" in planner
 
 
+def family_of(planner: str) -> str:
+    """The optimizer of a planner; the paper's is CEM."""
+    first = planner.partition(",")[0]
+    return first if first in FAMILIES else "cem"
+
+
 def draw(axes: Axes, points: Sequence[Point]) -> None:
     """One panel: every planner, its range over runs, and the Pareto line."""
     for point in points:
-        family = point.planner.partition(",")[0]
+        family = family_of(point.planner)
         gflop = point.flop / 1e9
         fill = "none" if is_extended(point.planner) else "full"
         look = {"color": COLORS[family], "fillstyle": fill, "markersize": 5}
