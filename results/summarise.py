@@ -1,6 +1,6 @@
 """Summarise runs of one environment: returns and scores per physics, over seeds.
 
-python results/summarise.py results/pendulum-quick/seed-*
+python results/summarise.py results/pendulum-quick/tmcl/seed-*
 """
 
 import sys
