@@ -117,8 +117,11 @@ def save_figure(points: dict[str, list[Point]], value: str, path: Path, source: 
             draw(axes, found)
             axes.set_title(f"{physics} physics")
             style.label_axis(axes, "GFLOP per step", value)
-        looks = [(name, marker, COLORS[name], "full") for name, marker in FAMILIES.items()]
-        looks.insert(1, ("cem, warm or settling", FAMILIES["cem"], COLORS["cem"], "none"))
+        shown = [point.planner for found in points.values() for point in found]
+        there = {family_of(planner) for planner in shown}
+        looks = [(name, FAMILIES[name], COLORS[name], "full") for name in FAMILIES if name in there]
+        if any(map(is_extended, shown)):
+            looks.insert(1, ("cem, warm or settling", FAMILIES["cem"], COLORS["cem"], "none"))
         handles = [
             Line2D([], [], color=color, marker=marker, fillstyle=fill, linestyle="", label=name)
             for name, marker, color, fill in looks

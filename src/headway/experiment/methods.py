@@ -46,6 +46,9 @@ _PLAIN: Settings = {
 }
 """One network without heads, context or noise."""
 
+_KEEP_LEARNING: Settings = {"planner.adaptation": "last-layer", "planner.change_threshold": 20.0}
+"""What was learned is dropped when the physics change; where they do not, it costs nothing."""
+
 _ONLY_A_TEST: Settings = {"collection.num_iterations": 1}
 _ONE_HEAD: Settings = {"model.num_heads": 1, "fitting.oracle": "independent"}
 _PETS: Settings = {**_NO_CONTEXT, **_ONE_HEAD, "fitting.future_length": 1}
@@ -66,7 +69,7 @@ _METHODS = (
     Method(
         "tmcl-bayes",
         "T-MCL whose heads keep learning while they act: a Bayesian last layer",
-        {"planner.adaptation": "last-layer"},
+        _KEEP_LEARNING,
     ),
     Method(
         "mcl",
@@ -81,7 +84,7 @@ _METHODS = (
     Method(
         "pets-bayes",
         "PETS whose head keeps learning while it acts: a Bayesian last layer",
-        {**_PETS, "planner.adaptation": "last-layer"},
+        {**_PETS, **_KEEP_LEARNING},
     ),
     Method(
         "mh-pets",
