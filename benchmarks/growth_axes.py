@@ -5,9 +5,7 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 from workloads import EPISODE_LENGTH, make_agent, make_fit, make_trajectories
 
 from headway.config import FittingConfig, ModelConfig, PlannerConfig
@@ -15,7 +13,7 @@ from headway.data import Episodes, Samples
 from headway.models.compilation import compiler_options, jit_networks
 from headway.models.dynamics import Statistics
 from headway.models.fitting import assign_segments, fit_epoch, make_data
-from headway.models.meeting import Program
+from headway.models.meeting import Program, stack
 from headway.planning.agent import _act
 from headway.tasks.catalog import env_spec
 
@@ -79,8 +77,7 @@ def epoch_of_seeds(seeds: int) -> Work:
 
 def _over_seeds(function: Callable, seeds: int, *arguments: Any) -> Work:
     """A function of arguments that all seeds have, mapped over the seeds."""
-    arrays, fixed = eqx.partition(arguments, eqx.is_array)
-    stacked = eqx.combine(jax.tree.map(lambda x: jnp.stack([x] * seeds), arrays), fixed)
+    stacked = stack([arguments] * seeds)
     program = Program(function, lambda: {"compiler_options": compiler_options()})
     return lambda: program.together(stacked)
 

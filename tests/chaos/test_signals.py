@@ -135,6 +135,15 @@ def test_what_planning_took_is_counted_through_a_stop(at, tmp_path, monkeypatch)
     assert got.timed_steps < wanted.timed_steps  # repeated actions are not timed
 
 
+@pytest.fixture
+def heeded():
+    """SIGINT as at a terminal: what a shell starts in the background ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("heeded")
 def test_a_second_signal_stops_at_once(tmp_path):
     class Impatient(Progress):
         def advance(self, amount=1, **values):

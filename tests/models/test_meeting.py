@@ -142,13 +142,13 @@ def test_a_closed_meeting_stops_those_who_wait():
 
 
 def test_what_stays_the_same_is_stacked_once(monkeypatch):
-    stacked, whole = [], meetings._stack
+    stacked, whole = [], meetings.stack
 
     def stack(trees):
         stacked.append(trees[0])
         return whole(trees)
 
-    monkeypatch.setattr(meetings, "_stack", stack)
+    monkeypatch.setattr(meetings, "stack", stack)
     side_by_side(Meeting(), walker(0), walker(1))
     numbers = [x for x in stacked if eqx.is_array(x) and jnp.issubdtype(x.dtype, jnp.floating)]
     assert [x.shape for x in numbers] == [(4,), ()]  # the first state and the step, never again

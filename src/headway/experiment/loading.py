@@ -13,13 +13,12 @@ from headway.planning.acting import Acting
 from headway.storage import arrays
 from headway.storage.run_dir import RunDir
 from headway.tasks.base import Task
-from headway.tasks.catalog import env_spec
+from headway.tasks.catalog import env_options, env_spec, episode_length
 
 
 def need_of(config: Config) -> MemoryNeed:
     """The memory that training a configuration needs."""
-    length = config.collection.episode_length or env_spec(config.env).episode_length
-    return memory_need(config, load_task(config), length)
+    return memory_need(config, load_task(config), episode_length(config))
 
 
 def initial(config: Config, task: Task) -> Learned:
@@ -30,8 +29,7 @@ def initial(config: Config, task: Task) -> Learned:
 
 def learner_of(config: Config, task: Task) -> Learner:
     """The learner of a configuration."""
-    length = config.collection.episode_length or env_spec(config.env).episode_length
-    return make_learner(config, task, length)
+    return make_learner(config, task, episode_length(config))
 
 
 def load_learned(run: RunDir, config: Config) -> Learned:
@@ -73,5 +71,4 @@ def load_agent(run: RunDir, config: Config | None = None, arena: Arena | None = 
 def load_task(config: Config) -> Task:
     """The Task of a configuration, with its environment's options."""
     check_options(config)
-    spec = env_spec(config.env)
-    return spec.make_task(**{**spec.options, **config.env_options})
+    return env_spec(config.env).make_task(**env_options(config))

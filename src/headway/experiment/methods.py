@@ -11,7 +11,7 @@ from typing import Any
 from headway.config import PLAIN, Config
 from headway.errors import ConfigError, unknown_name
 from headway.settings import TOLERANCE, override, setting_names
-from headway.tasks.catalog import EnvSpec, env_spec
+from headway.tasks.catalog import EnvSpec, env_spec, episode_length
 
 Settings = Mapping[str, Any]
 
@@ -192,14 +192,16 @@ def _paper(spec: EnvSpec) -> Settings:
     return {"fitting.epochs": spec.epochs}
 
 
+_FAST_PLANNER: Settings = {
+    "planner.num_candidates": 100,
+    "planner.num_elites": 20,
+    "planner.num_iterations": 3,
+    "planner.num_particles": 5,
+}
+
+
 def _fast(spec: EnvSpec) -> Settings:
-    return {
-        **_paper(spec),
-        "planner.num_candidates": 100,
-        "planner.num_elites": 20,
-        "planner.num_iterations": 3,
-        "planner.num_particles": 5,
-    }
+    return {**_paper(spec), **_FAST_PLANNER}
 
 
 def _released_code(spec: EnvSpec) -> Settings:
@@ -226,10 +228,7 @@ def _quick(spec: EnvSpec) -> Settings:
         "fitting.warmup_iterations": 2,
         "fitting.relation_transitions": 20,
         "planner.horizon": 20,
-        "planner.num_candidates": 100,
-        "planner.num_elites": 20,
-        "planner.num_iterations": 3,
-        "planner.num_particles": 5,
+        **_FAST_PLANNER,
         "evaluation.every": 5,
         "evaluation.num_episodes": 8,
     }
@@ -362,7 +361,7 @@ def check_block(config: Config) -> None:
     Raises:
         ConfigError: `fitting.block_transitions` is too small.
     """
-    length = config.collection.episode_length or env_spec(config.env).episode_length
+    length = episode_length(config)
     if config.fitting.block_transitions < length:
         raise ConfigError(
             f"fitting.block_transitions is {config.fitting.block_transitions}, allowed: at least"

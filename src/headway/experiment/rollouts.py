@@ -23,7 +23,7 @@ from headway.planning.acting import Acting
 from headway.planning.controller import env_action
 from headway.sim_params import SimParamSets
 from headway.tasks.base import Task
-from headway.tasks.catalog import EnvSpec, env_spec
+from headway.tasks.catalog import EnvSpec, env_options, env_spec, episode_length
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,9 +54,9 @@ class Arena:
             BadEnvironmentError: The environment's spaces do not fit its Task.
         """
         spec, collection = env_spec(config.env), config.collection
-        options = {**spec.options, **config.env_options}
+        options = env_options(config)
         task = spec.make_task(**options)
-        length = collection.episode_length or spec.episode_length
+        length = episode_length(config)
         sim_params = config.sim_params or spec.sim_params
         vector = envs.make_vec(
             config.env,

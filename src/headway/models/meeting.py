@@ -253,7 +253,7 @@ class _Stacks:
         """One tree with a leading axis of seeds."""
         name = tuple(map(id, trees))
         # The trees are kept, so that nothing else can have their ids.
-        found = self._known.get(name) or (trees, _stack(trees))
+        found = self._known.get(name) or (trees, stack(trees))
         self._used[name] = found
         return found[1]
 
@@ -267,7 +267,7 @@ class _Stacks:
         return results
 
 
-def _stack(trees: Sequence[Any]) -> Any:
+def stack(trees: Sequence[Any]) -> Any:
     """One tree of longer arrays; what is no array is the same in all of them."""
     fixed = eqx.filter(trees[0], eqx.is_array, inverse=True)
     return eqx.combine(_stack_arrays([eqx.filter(tree, eqx.is_array) for tree in trees]), fixed)

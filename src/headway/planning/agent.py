@@ -44,7 +44,6 @@ class AgentState(NamedTuple):
     """What the heads learned in this episode."""
     sim_params: Float[Array, "env sim_param"] | None = None
     """The true simulator parameters, for a model that is told them."""
-    """What the heads learned in this episode."""
 
 
 class Decision(NamedTuple):

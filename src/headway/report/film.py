@@ -1,12 +1,13 @@
 """Drawing a film: the picture of each step, the physics in force, and who planned."""
 
+import dataclasses
 import io
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
+from jaxtyping import Int, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from headway.errors import ConfigError
@@ -23,17 +24,16 @@ CAPTION = "head that each network of the ensemble planned with"
 LAST_FRAME = 1500  # milliseconds that the end is seen
 
 
-class Shown(Protocol):
-    """What a frame is drawn from."""
+@dataclasses.dataclass(frozen=True)
+class Moment:
+    """One step of an episode, as it looked after the step."""
 
-    @property
-    def image(self) -> np.ndarray: ...  # noqa: D102
-    @property
-    def sim_params(self) -> Mapping[str, float]: ...  # noqa: D102
-    @property
-    def reward(self) -> float: ...  # noqa: D102
-    @property
-    def heads(self) -> np.ndarray | None: ...  # noqa: D102
+    image: UInt8[np.ndarray, "height width 3"]
+    sim_params: Mapping[str, float]
+    """The physics in force."""
+    reward: float
+    heads: Int[np.ndarray, " member"] | None
+    """The head that each member planned with; None where the model has no heads."""
 
 
 def checked(path: Path) -> Path:
@@ -47,7 +47,7 @@ def checked(path: Path) -> Path:
     return path
 
 
-def draw(moments: Sequence[Shown], steps_per_second: float, suffix: str) -> bytes:
+def draw(moments: Sequence[Moment], steps_per_second: float, suffix: str) -> bytes:
     """Draw a film at the speed of the environment.
 
     Args:
@@ -87,7 +87,7 @@ class Panel:
         moments: Every step.
     """
 
-    def __init__(self, moments: Sequence[Shown]):
+    def __init__(self, moments: Sequence[Moment]):
         self._moments = moments
         self._returns = np.cumsum([moment.reward for moment in moments])
         self._names = list(moments[0].sim_params)

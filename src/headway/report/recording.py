@@ -7,7 +7,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from jaxtyping import Int, UInt8
 
 from headway.config import Config
 from headway.envs import make
@@ -18,21 +17,10 @@ from headway.experiment.methods import config_to_evaluate
 from headway.experiment.progress import Progress
 from headway.planning.controller import Controller
 from headway.report import film
+from headway.report.film import Moment
 from headway.storage import files
 from headway.storage.run_dir import RunDir
-from headway.tasks.catalog import env_spec
-
-
-@dataclasses.dataclass(frozen=True)
-class Moment:
-    """One step of an episode, as it looked after the step."""
-
-    image: UInt8[np.ndarray, "height width 3"]
-    sim_params: Mapping[str, float]
-    """The physics in force."""
-    reward: float
-    heads: Int[np.ndarray, " member"] | None
-    """The head that each member planned with; None where the model has no heads."""
+from headway.tasks.catalog import env_options, episode_length
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +77,7 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
     run = RunDir(run_dir)
     config = config_to_evaluate(run.config(), settings or {})
     controller = Controller(load_agent(run, config), seed=seed)
-    length = num_steps or config.collection.episode_length or env_spec(config.env).episode_length
+    length = num_steps or episode_length(config)
     env = _environment(config)
     options = {"sim_params": dict(sim_params or {}), "schedule": dict(schedule or {})}
     moments: list[Moment] = []
@@ -105,9 +93,8 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
 
 def _environment(config: Config) -> gymnasium.Env:
     """The environment of a run, ready to be drawn."""
-    spec = env_spec(config.env)
     own = {"sim_params": config.sim_params} if config.sim_params else {}
-    env = make(config.env, render_mode="rgb_array", **{**spec.options, **config.env_options}, **own)
+    env = make(config.env, render_mode="rgb_array", **env_options(config), **own)
     return env.unwrapped  # episodes are cut here, not by Gymnasium
 
 

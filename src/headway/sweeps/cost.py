@@ -14,7 +14,7 @@ from headway.storage.run_dir import RunDir
 from headway.sweeps.board import first_status
 from headway.sweeps.jobs import Job
 from headway.sweeps.status import State
-from headway.tasks.catalog import env_spec
+from headway.tasks.catalog import env_spec, episode_length
 
 PER_PRODUCT = 3.0  # a run takes about so much longer than its matrix products alone
 _SIZE, _PRODUCTS = 768, 12  # matrices that are multiplied to time this machine
@@ -72,7 +72,7 @@ def run_flop(config: Config, first_iteration: int = 0) -> float:
         first_iteration: Iterations before this one are done already.
     """
     task, spec = load_task(config), env_spec(config.env)
-    length = config.collection.episode_length or spec.episode_length
+    length = episode_length(config)
     per_step = plan_flop(config.model, config.planner, task)
     # Forwards, and backwards twice as much.
     per_sample = 6.0 * num_parameters(config, task) if config.model.learns else 0.0

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Mapping
 
+from headway.config import Config
 from headway.errors import ConfigError, unknown_name
 from headway.sim_params import SimParamSets
 from headway.tasks.base import Task
@@ -58,6 +59,16 @@ def env_spec(name_or_id: str) -> EnvSpec:
             return spec
     known = [spec.env_id for spec in _SPECS.values()] if "/" in name_or_id else _SPECS
     raise unknown_name("environment", name_or_id, known)
+
+
+def episode_length(config: Config) -> int:
+    """Steps of an episode: the run's own, or else the environment's."""
+    return config.collection.episode_length or env_spec(config.env).episode_length
+
+
+def env_options(config: Config) -> dict[str, bool]:
+    """All options of a run's environment: its own over the defaults."""
+    return {**env_spec(config.env).options, **config.env_options}
 
 
 def register(spec: EnvSpec) -> None:

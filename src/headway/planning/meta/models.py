@@ -83,8 +83,8 @@ class GradientAdapted(eqx.Module):
         return AdaptedDynamics(layers, self.statistics)
 
 
-class AdaptedDynamics(eqx.Module):
-    """A plain network whose weights differ between environments (see `Dynamics`)."""
+class OneNetwork(eqx.Module):
+    """What a plan with a single network without variance has in common (see `Dynamics`)."""
 
     layers: tuple[Layer, ...]
     statistics: Statistics
@@ -95,6 +95,10 @@ class AdaptedDynamics(eqx.Module):
     def widest(self) -> int:
         """See `Dynamics.widest`."""
         return max(layer.bias.shape[-1] for layer in self.layers)
+
+
+class AdaptedDynamics(OneNetwork):
+    """A plain network whose weights differ between environments."""
 
     @property
     def per_env(self) -> tuple[Layer, ...]:
@@ -147,22 +151,13 @@ class Recurrent(eqx.Module):
     def dynamics(self, memory: tuple[CellState, ...], precision: str) -> "RecurrentDynamics":
         """See `AdaptiveModel.dynamics`."""
         layers = plan_layers((*self.net.layers, self.net.output), precision)
-        return RecurrentDynamics(layers, memory, self.statistics)
+        return RecurrentDynamics(layers, self.statistics, memory)
 
 
-class RecurrentDynamics(eqx.Module):
-    """A recurrent network whose state goes on with every imagined step (see `Dynamics`)."""
+class RecurrentDynamics(OneNetwork):
+    """A recurrent network whose state goes on with every imagined step."""
 
-    layers: tuple[Layer, ...]
     state: tuple[CellState, ...]
-    statistics: Statistics
-    num_members = 1
-    stochastic = False
-
-    @property
-    def widest(self) -> int:
-        """See `Dynamics.widest`."""
-        return max(layer.bias.shape[-1] for layer in self.layers)
 
     @property
     def per_env(self) -> tuple[CellState, ...]:
@@ -171,7 +166,7 @@ class RecurrentDynamics(eqx.Module):
 
     def of_env(self, part: tuple[CellState, ...]) -> "RecurrentDynamics":
         """See `Dynamics.of_env`."""
-        return RecurrentDynamics(self.layers, part, self.statistics)
+        return RecurrentDynamics(self.layers, self.statistics, part)
 
     def start(self) -> tuple[CellState, ...]:
         """See `Dynamics.start`."""
