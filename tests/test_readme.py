@@ -69,3 +69,31 @@ def test_own_environment_guide(tmp_path, monkeypatch):
     assert np.abs(action) <= 3
     task = headway.env_spec("cart").make_task()
     assert jnp.isclose(task.reward(obs, jnp.array([1.0]), jnp.array([0.5, 0.1])), -0.26)
+
+
+def table_rows(path: str, heading: str) -> list[list[str]]:
+    """The cells of the first table under a heading."""
+    section = ("\n" + (ROOT / path).read_text()).partition(f"\n{heading}\n")[2]
+    table = re.search(r"(?:^\|.*\n)+", section, re.MULTILINE)
+    assert table is not None
+    lines = table.group().splitlines()[2:]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+@pytest.mark.parametrize(("preset", "column"), [("paper", 2), ("quick", 4)])
+def test_the_numbers_of_the_presets_are_those_of_the_page(preset, column):
+    config = headway.make_config("half-cheetah", preset=preset)
+    checked = 0
+    for cells in table_rows("docs/reproduce.md", "## The paper's numbers"):
+        told = {float(number) for number in re.findall(r"[\d.]+", cells[column] or cells[2])}
+        for name in re.findall(r"`([a-z_.]+)`", cells[1]):
+            section, _, field = name.partition(".")
+            values = np.atleast_1d(getattr(getattr(config, section), field))
+            assert set(values.tolist()) <= told, f"{name} is {values} with {preset}"
+            checked += 1
+    assert checked > 20
+
+
+def test_the_table_of_methods_has_every_method_once():
+    cells = [row[0] for row in table_rows("docs/methods.md", "# Methods")]
+    assert sorted(re.findall(r"\[`([\w-]+)`\]", " ".join(cells))) == sorted(headway.METHODS)
