@@ -1,6 +1,8 @@
 """What the README and the guides show works as it stands there."""
 
 import re
+import sys
+import types
 from pathlib import Path
 
 import gymnasium
@@ -47,28 +49,70 @@ class Cart(gymnasium.Env):
         return self.state.astype(np.float32), reward, False, False, {}
 
 
-@pytest.fixture
-def cart(monkeypatch):
-    monkeypatch.setattr(catalog, "_SPECS", dict(catalog._SPECS))
-    gymnasium.register("my_package/Cart-v0", Cart)
-    yield
-    del gymnasium.registry["my_package/Cart-v0"]
-
-
-@pytest.mark.usefixtures("cart")
-def test_own_environment_guide(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def guide(tmp_path_factory):
+    """What the guide to own environments defines, its run small; its folder is the current one."""
     (code,) = python_blocks("docs/own-environment.md")
     names: dict = {}
-    exec(compile(code.replace('"quick"', '"smoke"'), "own-environment.md", "exec"), names)
-    run = names["run"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(catalog, "_SPECS", dict(catalog._SPECS))
+        patch.chdir(tmp_path_factory.mktemp("guide"))
+        gymnasium.register("my_package/Cart-v0", Cart)
+        exec(compile(code.replace('"quick"', '"smoke"'), "own-environment.md", "exec"), names)
+        del gymnasium.registry["my_package/Cart-v0"]  # acting must do without
+        yield names
+
+
+def test_own_environment_guide(guide):
+    run = guide["run"]
     assert {row.group for row in run.evaluation} == {"train", "heavy"}
     obs = np.array([0.5, 0.0], np.float32)
-    action = headway.load(run.path).act(obs)
-    assert action.shape == (1,)
-    assert np.abs(action) <= 3
     task = headway.env_spec("cart").make_task()
     assert jnp.isclose(task.reward(obs, jnp.array([1.0]), jnp.array([0.5, 0.1])), -0.26)
+
+
+class Machine:
+    """The machine that docs/controller.md serves: a cart whose sensor fails."""
+
+    def __init__(self, readings):
+        self.readings, self.sent, self.stopped = iter(readings), [], False
+
+    def read(self):
+        return next(self.readings)
+
+    def send(self, action):
+        self.sent.append(action)
+
+    def stop(self):
+        self.stopped = True
+
+    def wait_for_next_period(self):
+        pass
+
+
+@pytest.mark.usefixtures("guide")
+def test_controller_guide(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "my_package", types.ModuleType("my_package"))
+    service, cheaper = python_blocks("docs/controller.md")
+    service = service.replace("-quick-", "-smoke-").replace("deadline_ms=80", "deadline_ms=6e4")
+    names: dict = {}
+    exec(compile(service, "controller.md", "exec"), names)
+
+    seen = np.array([0.5, 0.0])
+    machine = Machine([seen, None, None, seen, [1e6, 0.0], *4 * [None]])
+    assert names["serve"](machine, 20).startswith("obs[0] is nan")  # a horizon of 4 holds for 3
+    assert machine.stopped
+    sent = np.stack(machine.sent)
+    assert sent.shape == (8, 1)
+    assert sent.dtype == np.float32
+    assert (np.abs(sent) <= 3).all()
+    told = [line.split()[:2] for line in capsys.readouterr().out.splitlines()]
+    held = [["1", "held"], ["2", "held"]]
+    assert told == [*held, ["4", "planned"], *([str(step), "held"] for step in (5, 6, 7))]
+
+    # Without a deadline nothing is compiled here.
+    exec(compile(cheaper.replace("deadline_ms=80", ""), "controller.md", "exec"), names)
+    assert names["controller"].agent.planner.num_candidates == 50
 
 
 def table_rows(path: str, heading: str) -> list[list[str]]:
