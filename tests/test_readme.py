@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 import headway
+from headway.cli import main
+from headway.settings import setting_names
 from headway.tasks import catalog
 
 ROOT = Path(__file__).parent.parent
@@ -141,3 +143,41 @@ def test_the_numbers_of_the_presets_are_those_of_the_page(preset, column):
 def test_the_table_of_methods_has_every_method_once():
     cells = [row[0] for row in table_rows("docs/methods.md", "# Methods")]
     assert sorted(re.findall(r"\[`([\w-]+)`\]", " ".join(cells))) == sorted(headway.METHODS)
+
+
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "results").rglob("README.md")),
+]
+COMMANDS = [
+    "train",
+    "evaluate",
+    "record",
+    "report",
+    "diagnose",
+    "reproduce",
+    "sweep",
+    "plot-dynamics",
+]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_options_that_the_pages_show_exist(command, capsys):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    offered = set(re.findall(r"--[a-z][\w.-]*\w", capsys.readouterr().out))
+    for page in PAGES:
+        text = re.sub(r"\\\n\s*", " ", page.read_text())
+        for shown in re.findall(rf"headway {command} ([^`\n#]*)", text):
+            unknown = set(re.findall(r"--[a-z][\w.-]*\w", shown)) - offered
+            assert not unknown, f"{page.name} shows headway {command} with {unknown}"
+
+
+def test_settings_that_the_pages_name_exist():
+    known = setting_names(headway.make_config("pendulum"))
+    for page in PAGES:
+        named = re.findall(
+            r"`((?:model|fitting|planner|collection|evaluation)\.(?!csv)[a-z_]+)", page.read_text()
+        )
+        assert set(named) <= set(known), page.name
