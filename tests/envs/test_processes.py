@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 
 import misbehaving
 from headway.envs import ProcessVectorEnv, SequentialVectorEnv
-from headway.errors import BadEnvironmentError, ConfigError
+from headway.errors import BadEnvironmentError, BrokenEpisodeError, ConfigError
 
 TIMEOUT_S = 20.0
 """For steps that answer; the machine may be busy."""
@@ -126,6 +126,29 @@ def test_a_reset_that_hangs_is_tried_again_in_the_next_episode(tmp_path):
     assert info["broken"] == {0: "did not answer to reset within 1 s"}
     assert np.isnan(obs).any(1).tolist() == [True, False]
     obs, reward, _, truncated, info = vector.step(ones(vector))
+    assert "broken" not in info
+    assert np.isfinite(obs).all()
+    assert (reward.tolist(), truncated.tolist()) == ([0.0, 1.0], [False, False])
+    vector.close()
+
+
+def test_a_next_episode_that_cannot_begin_is_cut_and_tried_again():
+    class Falls(misbehaving.Drift):
+        def reset(self, **given):
+            if self.elapsed:
+                self.elapsed = 0
+                raise BrokenEpisodeError("it fell over")
+            return super().reset(**given)
+
+    vector = SequentialVectorEnv([Falls, misbehaving.Drift], episode_length=2)
+    vector.reset(seed=0)
+    for _ in range(2):
+        vector.step(ones(vector))
+    obs, reward, _, truncated, info = vector.step(ones(vector))
+    assert info["broken"] == {0: "it fell over"}
+    assert np.isnan(obs).any(1).tolist() == [True, False]
+    assert np.isnan(reward).tolist() == truncated.tolist() == [True, False]
+    obs, reward, _, truncated, info = vector.step(ones(vector))  # begins at last
     assert "broken" not in info
     assert np.isfinite(obs).all()
     assert (reward.tolist(), truncated.tolist()) == ([0.0, 1.0], [False, False])
