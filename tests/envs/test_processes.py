@@ -208,6 +208,23 @@ def test_only_the_parent_answers_a_request_to_stop():
     vector.close()
 
 
+def test_a_process_that_dies_in_the_middle_of_its_answer_costs_its_episode_only(monkeypatch):
+    vector = made("swell", at=1)
+    vector.reset(seed=0)
+    worker = vector._workers[0]
+    receive = worker.receive
+
+    def killed_first(*given):
+        wait_for(lambda: worker._connection.poll(0))  # it has begun to answer, and must wait
+        os.killpg(worker.pid, signal.SIGKILL)
+        return receive(*given)
+
+    monkeypatch.setattr(worker, "receive", killed_first)
+    info = vector.step(ones(vector))[-1]
+    assert info["broken"] == {0: "had its process killed by SIGKILL during step"}
+    vector.close()
+
+
 @pytest.mark.parametrize("how", ["change_spaces", "change_actions"])
 def test_spaces_must_stay_as_they_are(how):
     for vector in (made(how, at=0), SequentialVectorEnv(some(how, at=0))):
