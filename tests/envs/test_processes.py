@@ -255,7 +255,8 @@ def act(how):
     signal.signal(signal.SIGINT, signal.default_int_handler)
     one = functools.partial(misbehaving.Drift, how)
     vector = ProcessVectorEnv([one, misbehaving.Drift], step_timeout_s=500.0)
-    print(os.getpid(), *vector.pids, flush=True)
+    line = " ".join(map(str, (os.getpid(), *vector.pids)))
+    os.write(1, f"{line}\\n".encode())  # whole, or the lines of four processes mix
     vector.reset(seed=0)
     for step in range(3):
         vector.step(np.ones((2, 1), np.float32))
