@@ -54,6 +54,24 @@ def test_a_run_that_does_not_fit_may_be_tried_all_the_same(monkeypatch, tmp_path
         training.train_run(config, tmp_path / "run", ignore_limits=True)
 
 
+def test_a_begun_run_goes_on_where_limits_are_ignored(monkeypatch, tmp_path):
+    class LoadedError(Exception):
+        pass
+
+    def load(*_):
+        raise LoadedError
+
+    monkeypatch.setattr(limits, "free_memory", lambda: 0)
+    monkeypatch.setattr(limits, "resident", lambda: 0)
+    monkeypatch.setattr(RunDir, "finished_iterations", 1)
+    monkeypatch.setattr(RunDir, "load_data", lambda run: [])
+    monkeypatch.setattr(RunDir, "check", lambda run: None)
+    monkeypatch.setattr(loading.arrays, "load_tree", load)
+    config = make_config("pendulum", preset="smoke")
+    with pytest.raises(LoadedError):
+        training.train_run(config, tmp_path / "run", ignore_limits=True)
+
+
 def test_a_model_that_does_not_fit_is_not_built(monkeypatch, tmp_path):
     settings = {"model.hidden_sizes": (10**9,) * 4, "model.num_members": 10**8}
     settings["planner.num_particles"] = 10**8

@@ -93,7 +93,10 @@ class Trainer:
             for trajectory in run.load_data() if learner.learns else ():
                 buffer.add(trajectory)
             finished = run.finished_iterations
-            learned = initial(config, arena.task) if finished == 0 else load_learned(run, config)
+            if finished == 0:
+                learned = initial(config, arena.task)
+            else:  # the limits were looked at before, or are to be ignored
+                learned = load_learned(run, config, ignore_limits=True)
             unless_open.pop_all()
         return cls(config, run, arena, learner, learned, buffer, progress, stop)
 
