@@ -259,4 +259,8 @@ def test_arithmetic_of_a_run_follows_its_settings(tmp_path):
     config = fakes.tiny_job(tmp_path).config
     fitting = whole - steps * plan_flop(config.model, config.planner, load_task(config))
     assert flop(**{"fitting.epochs": 2}) == pytest.approx(whole + fitting)
+    always = flop(**{"evaluation.training_group": "always"})  # once more, after iteration 0
+    assert always - whole == pytest.approx((whole - fitting) / steps * 2 * 6)
+    seldom = {"evaluation.training_group": "always", "evaluation.every": 2}
+    assert flop(**seldom) == flop(**{"evaluation.every": 2})
     assert flop(**{"planner.horizon": 6}) == pytest.approx(2 * whole - fitting)
