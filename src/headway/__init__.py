@@ -22,10 +22,12 @@ if TYPE_CHECKING:
     from headway.data import Trajectory as Trajectory
     from headway.errors import BadEnvironmentError as BadEnvironmentError
     from headway.errors import BrokenEpisodeError as BrokenEpisodeError
+    from headway.errors import BusyError as BusyError
     from headway.errors import ConfigError as ConfigError
     from headway.errors import DivergenceError as DivergenceError
     from headway.errors import HeadwayError as HeadwayError
     from headway.errors import LimitError as LimitError
+    from headway.errors import PlanningError as PlanningError
     from headway.errors import RunError as RunError
     from headway.errors import SeedsError as SeedsError
     from headway.errors import UnknownNameError as UnknownNameError
@@ -64,8 +66,10 @@ _HOME = {
         "DivergenceError",
         "BadEnvironmentError",
         "BrokenEpisodeError",
+        "BusyError",
         "HeadwayError",
         "LimitError",
+        "PlanningError",
         "RunError",
         "SeedsError",
         "UnknownNameError",
