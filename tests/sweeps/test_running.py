@@ -98,8 +98,8 @@ def test_without_ray_it_says_what_to_install(training, tmp_path, monkeypatch):
     board = fakes.Remembering()
     run_jobs(jobs, Workers(), board)
     assert len(training.calls) == 2
-    assert "pip install 'headway[ray]'" in board.messages[0]
-    with pytest.raises(ConfigError, match=r"pip install 'headway\[ray\]'"):
+    assert "`pip install '.[ray]'` in the clone" in board.messages[0]
+    with pytest.raises(ConfigError, match=r"pip install '\.\[ray\]'"):
         run_jobs([fakes.tiny_job(tmp_path, 2)], Workers(address="auto"), board)
 
 
