@@ -35,6 +35,18 @@ class Status(NamedTuple):
     """From the call of `act` to the action."""
 
 
+class _Found(NamedTuple):
+    """What planning came to."""
+
+    action: Float[np.ndarray, " action"]
+    """In [-1, 1]."""
+    failures: int
+    """Iterations without any finite return."""
+    iterations: int
+    complete: bool
+    """Whether the search ended by itself."""
+
+
 class Controller:
     """Acts with a trained agent, one step at a time.
 
@@ -48,7 +60,8 @@ class Controller:
         agent: The trained agent.
         seed: Seeds the planner's draws.
         deadline_ms: Milliseconds after which `act` answers with the best plan so far; None plans
-            to the end. Everything is compiled and timed first, while the controller is built.
+            to the end. Everything that `act` can need is compiled and timed first, while the
+            controller is built.
             Where no earlier plan is left, as in the first step, one iteration is made even if
             it is late. The promise is that of a program in Python: `status.seconds` has what a
             step took, with any pause of the system.
@@ -68,13 +81,14 @@ class Controller:
         max_deviations: float | None = 10.0,
     ):
         self.agent = agent
-        self._seed = seed
-        self._episode = -1
+        self._seed, self._episode = seed, -1
         self._range = self._deadline = None
         if isinstance(agent, Agent) and max_deviations is not None:
             self._range = RangeCheck(agent.task, agent.statistics.features, max_deviations)
         if deadline_ms is not None:
             self._deadline = self._planner_to(deadline_ms)
+            self._rehearse(self._deadline)
+        self._episode = -1
         self.reset()
 
     def reset(self, sim_params: Mapping[str, float] | None = None) -> None:
@@ -116,31 +130,19 @@ class Controller:
         if problem is not None:
             return self._hold(f"{problem}; check the sensor", started)
         warnings = self._range(entries) if self._range else ()
-        if self._deadline is None:
-            self._state, decision = self.agent.act(self._state, entries[None])
-            done, complete = self._num_iterations, True
-        else:
-            at_least = 0 if self._left > 0 else 1  # there is nothing else to do
-            self._state, decision, done, complete = self._deadline.act(
-                self._state, entries[None], started, at_least
-            )
-        scaled, heads, failures = jax.device_get(
-            (decision.action[0], decision.heads, decision.failures[0])
-        )
-        self._heads = None if heads is None else heads[0]
-        failures = int(failures)
-        reason = ""
+        found = self._plan(entries, started)
+        done, reason = found.iterations, ""
         if done == 0:
             reason = "no iteration of the planner fits the deadline"
-        elif failures >= done:
+        elif found.failures >= done:
             reason = f"none of {done} iterations of the planner found a finite return"
-        elif not complete:
+        elif not found.complete:
             reason = f"time was up after {done} of {self._num_iterations} iterations"
-        failed = done == 0 or failures >= done
+        failed = found.failures >= done
         self._count(failed, reason)
-        outcome = "held" if failed else "planned" if complete else "deadline"
+        outcome = "held" if failed else "planned" if found.complete else "deadline"
         self._status = Status(outcome, reason, warnings, done, time.perf_counter() - started)
-        return env_action(self.agent.task, scaled)
+        return env_action(self.agent.task, found.action)
 
     @property
     def status(self) -> Status | None:
@@ -177,9 +179,37 @@ class Controller:
                 f"a {type(self.agent).__name__} cannot plan to a deadline, allowed: an agent that"
                 " was trained; pass deadline_ms=None."
             )
-        planner = DeadlinePlanner(self.agent, deadline_ms / 1000)
+        return DeadlinePlanner(self.agent, deadline_ms / 1000)
+
+    def _rehearse(self, planner: DeadlinePlanner) -> None:
+        """Live through all that `act` can meet, so that everything is compiled and timed."""
+        self.reset(dict.fromkeys(self.agent.sim_param_names, 1.0))
+        obs = np.zeros(self.agent.task.obs_size, np.float32)
+        soon, late = float("inf"), -float("inf")
+        for left, started in ((0, soon), (1, soon), (1, late), (0, late)):
+            if self._range:
+                self._range(obs)
+            self._left = left
+            self._plan(obs, started)
+        self._left = 1
+        self._hold("a rehearsal", soon)
         planner.warm_up()
-        return planner
+
+    def _plan(self, obs: Float[np.ndarray, " obs"], started: float) -> "_Found":
+        """Search for a plan, as long as there is time, and remember where that led."""
+        if self._deadline is None:
+            self._state, decision = self.agent.act(self._state, obs[None])
+            done, complete = self._num_iterations, True
+        else:
+            at_least = 0 if self._left > 0 else 1  # there is nothing else to do
+            self._state, decision, done, complete = self._deadline.act(
+                self._state, obs[None], started, at_least
+            )
+        action, heads, failures = jax.device_get(
+            (decision.action[0], decision.heads, decision.failures[0])
+        )
+        self._heads = None if heads is None else heads[0]
+        return _Found(action, int(failures), done, complete)
 
     def _checked(self, obs: Any) -> np.ndarray:
         """An observation of the right shape, of a controller that was told what it must be."""
