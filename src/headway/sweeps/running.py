@@ -66,7 +66,9 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, board: Board) -> None:
         run_here(missing, board, seeds_together=True)
     elif workers.one_by_one or not ray_is_installed():
         if workers.address:
-            raise ConfigError(f"a Ray cluster needs Ray, which is missing; {INSTALL_RAY} installs it.")
+            raise ConfigError(
+                f"a Ray cluster needs Ray, which is missing; {INSTALL_RAY} installs it."
+            )
         if not workers.one_by_one and len(missing) > 1:
             board.message(f"runs go one after another; {INSTALL_RAY} lets them go side by side")
         run_here(missing, board)
