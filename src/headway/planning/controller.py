@@ -175,9 +175,10 @@ class Controller:
                 f"deadline_ms is {deadline_ms}, allowed: milliseconds above 0, or None for none."
             )
         if not isinstance(self.agent, Agent):
+            name = getattr(self.agent, "method", type(self.agent).__name__)
             raise ConfigError(
-                f"a {type(self.agent).__name__} cannot plan to a deadline, allowed: an agent that"
-                " was trained; pass deadline_ms=None."
+                f"deadline_ms is {deadline_ms:g}, but {name} cannot be cut off in the middle of a"
+                " plan, allowed: None; or take a method that can, such as tmcl or pets."
             )
         return DeadlinePlanner(self.agent, deadline_ms / 1000)
 
