@@ -160,9 +160,11 @@ def test_without_time_for_any_iteration_the_last_plan_goes_on_until_it_ends(monk
     assert controller.status.outcome == "held"
 
 
-SERVICE = [  # what is seen, how often the clock allows another iteration, what comes of it
+SERVICE = [  # what is seen, how often another iteration fits, what comes of it, what was applied
     (OBS, 4, "planned"),
     (OBS, 4, "planned"),
+    (OBS, 4, "planned", [0.1, 0.2]),
+    (OBS, 4, "planned", BLIND),
     (BLIND, 0, "held"),
     ([1e6, 0.0], 4, "planned"),  # unlike anything that was trained on
     *[(OBS, times, "deadline") for times in (1, 2, 3)],
@@ -180,10 +182,11 @@ def test_with_a_deadline_nothing_is_compiled_in_service(settings, monkeypatch, c
     controller = Controller(make_agent(**settings), deadline_ms=LONG)
     assert controller._deadline is not None
     with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
-        for obs, times, outcome in SERVICE:
+        for obs, times, outcome, *rest in SERVICE:
+            applied = rest[0] if rest else None
             clock = iter([True] * times)
             monkeypatch.setattr(controller._deadline, "_fits", lambda _, c=clock: next(c, False))
-            controller.act(obs)
+            controller.act(obs, applied_action=applied)
             assert controller.status is not None
             assert controller.status.outcome == outcome
         controller.reset()

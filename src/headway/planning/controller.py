@@ -6,15 +6,16 @@ from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from headway.config import PlannerConfig
-from headway.errors import ConfigError, PlanningError, shown
+from headway.errors import ConfigError, PlanningError
 from headway.planning.acting import Acting
 from headway.planning.agent import Agent, hold
-from headway.planning.checking import RangeCheck, not_finite
+from headway.planning.checking import RangeCheck, in_bounds, not_finite, one_row
 from headway.planning.deadline import DeadlinePlanner
 from headway.tasks.base import Task
 
@@ -110,22 +111,32 @@ class Controller:
         self._status: Status | None = None
         self._left = 0  # steps of the last plan that are still to come
 
-    def act(self, obs: ArrayLike) -> Float[np.ndarray, " action"]:
+    def act(
+        self, obs: ArrayLike, *, applied_action: ArrayLike | None = None
+    ) -> Float[np.ndarray, " action"]:
         """Choose the next action.
 
         Args:
             obs: The observation, as the environment returned it; one number per entry.
+            applied_action: The action that led here, in the environment's own units, where it is
+                not the one that the last call returned: a safety layer limited it, or an
+                operator took over. Heads are chosen and contexts computed from what was applied.
+                An entry that is not finite says that it is not known; nothing is learned from
+                that step then. At the first call of an episode no action counts.
 
         Returns:
             The action, in the environment's own units and within its bounds.
 
         Raises:
-            ConfigError: The observation has another shape, or the model wants to be told the
-                simulator parameters and was not.
+            ConfigError: The observation or the applied action has another shape, the applied
+                action is out of bounds, or the model wants to be told the simulator parameters
+                and was not.
             PlanningError: There is no new plan, and no earlier one is left.
         """
         started = time.perf_counter()
         entries = self._checked(obs)
+        if applied_action is not None:
+            self._correct(applied_action)
         problem = not_finite(entries)
         if problem is not None:
             return self._hold(f"{problem}; check the sensor", started)
@@ -192,6 +203,8 @@ class Controller:
                 self._range(obs)
             self._left = left
             self._plan(obs, started)
+        for action in (self.agent.task.action_low, np.full(self.agent.task.action_size, np.nan)):
+            self._correct(action)
         self._left = 1
         self._hold("a rehearsal", soon)
         planner.warm_up()
@@ -220,21 +233,22 @@ class Controller:
                 f"the controller was told no sim_params, allowed: a value for each of {names},"
                 ' which its model takes as input; call reset(sim_params=info["sim_params"]) first.'
             )
-        size = self.agent.task.obs_size
-        try:
-            with np.errstate(over="ignore"):  # what is too large becomes infinite
-                entries = np.asarray(obs).astype(np.float32)
-        except (TypeError, ValueError):
-            raise ConfigError(
-                f"obs is {shown(obs)}, allowed: {size} numbers; pass one observation as the"
-                " environment returns it."
-            ) from None
-        if entries.shape != (size,):
-            raise ConfigError(
-                f"obs has shape {entries.shape}, allowed: ({size},); pass one observation as the"
-                " environment returns it."
-            )
-        return entries
+        advice = "pass one observation as the environment returns it"
+        return one_row("obs", obs, self.agent.task.obs_size, advice)
+
+    def _correct(self, applied_action: Any) -> None:
+        """Let the last step be remembered with the action that was applied, if it is known."""
+        task = self.agent.task
+        advice = "pass one action in the environment's units, as `act` returns it"
+        action = one_row("applied_action", applied_action, task.action_size, advice)
+        if self._planner is None:  # an agent that remembers no actions
+            return
+        if np.isfinite(action).all():
+            in_bounds("applied_action", action, task)
+            scaled = jnp.asarray(scaled_action(task, action)[None])
+            self._state = self._state._replace(action=scaled)
+        else:
+            self._state = self._state._replace(acted=jnp.asarray(np.zeros(1, bool)))
 
     def _hold(self, reason: str, started: float) -> Float[np.ndarray, " action"]:
         """The next action of the last plan."""
@@ -271,3 +285,11 @@ def env_action(
     low, high = np.asarray(task.action_low), np.asarray(task.action_high)
     scaled = low + 0.5 * (action.astype(np.float64) + 1.0) * (high - low)
     return np.clip(scaled, low, high).astype(np.float32)
+
+
+def scaled_action(
+    task: Task, action: Float[np.ndarray, "*batch action"]
+) -> Float[np.ndarray, "*batch action"]:
+    """`Task.unscale_action` in NumPy."""
+    low, high = np.asarray(task.action_low), np.asarray(task.action_high)
+    return (2.0 * (action.astype(np.float64) - low) / (high - low) - 1.0).astype(np.float32)
