@@ -29,7 +29,11 @@ class Method:
 
 @dataclasses.dataclass(frozen=True)
 class Preset:
-    """A scale of experiment; `settings` may depend on the environment."""
+    """A scale of experiment; `settings` may depend on the environment.
+
+    What only some methods can use belongs in their `Method.by_preset`: whatever a preset sets is
+    in the directory names of all its runs (`headway.sweeps.jobs.fingerprint`).
+    """
 
     name: str
     description: str
