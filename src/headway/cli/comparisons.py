@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from headway.cli.arguments import Flag
-from headway.cli.arguments import _unset as unset
+from headway.cli.arguments import Flag, default_text
 from headway.cli.output import print_json, print_tables
 from headway.cli.seeds import read_seeds
 from headway.cli.usage import UsageError, parse
@@ -29,7 +28,7 @@ PAPER_ENVS = (
 class _Runs:
     """Options of both commands."""
 
-    envs: Annotated[tuple[str, ...], unset("the paper's six")] = PAPER_ENVS
+    envs: Annotated[tuple[str, ...], default_text("the paper's six")] = PAPER_ENVS
     """Environments; `headway list envs` shows them."""
     seeds: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SEED|FROM:TO")] = ("0:3",)
     """Seeds, or ranges without their end: 0:3 is 0 1 2."""
@@ -44,11 +43,11 @@ class _Runs:
     seeds_together: Flag = False
     """Train the seeds of each configuration in one program, in this process and without Ray; on a
     GPU small networks gain by it."""
-    address: Annotated[str | None, unset("Ray on this machine")] = None
+    address: Annotated[str | None, default_text("Ray on this machine")] = None
     """A Ray cluster, for example `auto`; it must see --out under the same path."""
     cpus_per_run: float = 1.0
     """Cores that one run reserves, and threads that it computes with."""
-    gpus_per_run: Annotated[float | None, unset("1 where there are GPUs")] = None
+    gpus_per_run: Annotated[float | None, default_text("1 where there are GPUs")] = None
     """GPUs that one run reserves; a fraction lets several share one."""
     json: Flag = False
     """Print one JSON line on stdout instead of tables."""
