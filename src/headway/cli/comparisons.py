@@ -65,7 +65,10 @@ class _Experiment:
 
 @dataclasses.dataclass(frozen=True)
 class Reproduce(_Runs, _Experiment):
-    """Run what is missing of an experiment of the paper, and draw and tabulate it."""
+    """Run what is missing of an experiment of the paper, and draw and tabulate it.
+
+    The figure compares the runs; `headway report OUT/runs` shows what is inside each of them.
+    """
 
     settings: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Settings of every arm, for example collection.num_iterations=3."""
@@ -73,7 +76,10 @@ class Reproduce(_Runs, _Experiment):
 
 @dataclasses.dataclass(frozen=True)
 class Sweep(_Runs):
-    """Run methods in environments with seeds and settings, all of them with each other."""
+    """Run methods in environments with seeds and settings, all of them with each other.
+
+    The figure compares the runs; `headway report OUT/runs` shows what is inside each of them.
+    """
 
     methods: tuple[str, ...] = ("tmcl",)
     """Methods; `headway list methods` shows them."""
