@@ -150,7 +150,7 @@ def _compare(
     if arguments.json:
         print_json(_facts(done))
     else:
-        from headway.report.comparison_tables import results
+        from headway.report.comparison.terminal import results
 
         print_tables(*results(done.found))
         print("Written:", *done.files, sep="\n  ")
@@ -170,7 +170,7 @@ def _facts(done: Any) -> dict[str, Any]:
 
 
 def _print_plan(comparison: "Comparison", as_json: bool) -> int:
-    from headway.report.comparison_tables import plan
+    from headway.report.comparison.terminal import plan
     from headway.sweeps.cost import make_plan
 
     entries, table = plan(comparison, make_plan(comparison.jobs))
