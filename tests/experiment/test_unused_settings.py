@@ -134,7 +134,18 @@ def test_the_settings_of_an_optimizer_are_all_that_it_takes(name):
     assert fields == {*OPTIMIZER_SETTINGS[name], *SHARED_BY_OPTIMIZERS}
 
 
-SLOW = ["tmcl", "mcl", "pets", "vanilla", "ria", "grbal", "rebal", "true-dynamics"]
+SLOW = [
+    "tmcl",
+    "mcl",
+    "mh-pets",
+    "pets",
+    "stacked",
+    "vanilla",
+    "ria",
+    "grbal",
+    "rebal",
+    "true-dynamics",
+]
 
 
 @pytest.mark.parametrize(

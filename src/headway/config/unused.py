@@ -1,6 +1,7 @@
 """Which settings cannot change a run, because its model or its planner has no use for them.
 
-A setting that is not named here counts as used, always.
+A setting that is not named here counts as used, always. Results are what training writes; a test
+with another planner later (`headway evaluate`) may well read what training did not.
 """
 
 import dataclasses
