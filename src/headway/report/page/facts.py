@@ -24,7 +24,7 @@ def settings(comparison: Comparison) -> Section:
     """The settings in which the runs of an environment differ."""
     lead = (
         "Settings that are not the same in all runs of an environment, seeds aside. Everything else"
-        " is equal."
+        " that the runs use is equal."
     )
     blocks = [_settings_of(comparison, env) for env in comparison.envs]
     return Section("settings", "Settings that differ", lead, blocks)

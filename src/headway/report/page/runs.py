@@ -140,7 +140,7 @@ def _without_copies(runs: Sequence[LoadedRun], notes: list[Note]) -> list[Loaded
     """Leave out runs of the same settings and seed: they would count one seed twice."""
     kept: list[LoadedRun] = []
     for run in runs:
-        same = next((other for other in kept if other.config == run.config), None)
+        same = next((o for o in kept if not settings.differences(o.config, run.config)), None)
         if same is None:
             kept.append(run)
         else:
