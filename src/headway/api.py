@@ -9,7 +9,7 @@ from headway.config import Config
 from headway.errors import ConfigError, shown
 from headway.experiment.evaluation import PlanningCost, episode_rows
 from headway.experiment.loading import load_agent
-from headway.experiment.methods import make_config
+from headway.experiment.methods import config_to_control, make_config
 from headway.experiment.progress import Progress
 from headway.experiment.seeds import train_seeds as train_together
 from headway.experiment.testing import run_tests
@@ -36,7 +36,7 @@ class Run:
     """The figures made after training."""
 
     def controller(self, *, seed: int = 0, **options: Any) -> Controller:
-        """The trained controller; options are those of `Controller`."""
+        """The trained controller; options are those of `load`."""
         return load(self.path, seed=seed, **options)
 
 
@@ -208,18 +208,31 @@ def evaluate(
     return Evaluation(rows, tested.config, cost)
 
 
-def load(run_dir: str | Path, *, seed: int = 0, **options: Any) -> Controller:
+def load(
+    run_dir: str | Path,
+    *,
+    seed: int = 0,
+    settings: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Controller:
     """Load the controller of a run.
 
     Args:
         run_dir: The run directory.
         seed: Seeds the planner's draws.
+        settings: Changes of `planner` settings by dotted name, for example
+            `{"planner.num_candidates": 50}`, to control with another planner.
         options: Those of `Controller`, for example `deadline_ms=50`.
 
     Raises:
         RunError: There is no trained run, or it is damaged.
+        ConfigError: A setting is unknown, of the wrong type or out of range, or none of the
+            planner's; or as `Controller`.
+        LimitError: The model needs more memory than is free.
     """
-    return Controller(load_agent(RunDir(run_dir)), seed=seed, **options)
+    run = RunDir(run_dir)
+    config = config_to_control(run.config(), settings or {})
+    return Controller(load_agent(run, config), seed=seed, **options)
 
 
 def default_run_dir(config: Config) -> Path:
