@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import headway
-from headway.errors import ConfigError
+from headway.errors import ConfigError, RunError
 from headway.storage.run_dir import RunDir
 
 DATA = Path(__file__).parents[1] / "data"
@@ -49,3 +49,33 @@ def test_a_controller_can_go_on_learning(root):
 def test_what_a_controller_cannot_use_is_refused(settings, message, root):
     with pytest.raises(ConfigError, match=message):
         headway.load(root, settings=settings)
+
+
+SERVED = ("config.json", "manifests/iteration-001.json", "checkpoints/iteration-001.safetensors")
+
+
+def copy_of(root: Path, names) -> Path:
+    """A run directory with some files of another one."""
+    place = root.with_name("copy")
+    for name in names:
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(root / name, place / name)
+    return place
+
+
+def test_a_copy_without_tables_and_data_serves(root):
+    copy = copy_of(root, SERVED)
+    np.testing.assert_array_equal(headway.load(copy).act(OBS), headway.load(root).act(OBS))
+
+
+@pytest.mark.parametrize("missing", SERVED)
+def test_a_file_that_a_copy_lacks_is_named(missing, root):
+    copy = copy_of(root, [name for name in SERVED if name != missing])
+    with pytest.raises(RunError, match=missing.split("/")[0]) as caught:
+        headway.load(copy)
+    assert "go on training" not in str(caught.value)
+
+
+def test_learning_on_needs_the_data_as_well(root):
+    with pytest.raises(RunError, match="data/iteration-000"):
+        headway.load(copy_of(root, SERVED), settings={"planner.adaptation": "last-layer"})
