@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from headway.api import Evaluation as Evaluation
     from headway.api import Run as Run
     from headway.api import evaluate as evaluate
-    from headway.api import load as load
     from headway.api import train as train
     from headway.api import train_seeds as train_seeds
     from headway.config import Config as Config
@@ -47,6 +46,7 @@ if TYPE_CHECKING:
     from headway.report.page.build import write_report as write_report
     from headway.report.recording import Recording as Recording
     from headway.report.recording import record as record
+    from headway.service import load as load
     from headway.sim_params import SimParamSets as SimParamSets
     from headway.storage.run_dir import RunDir as RunDir
     from headway.storage.tables import EpisodeRow as EpisodeRow
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "api": ("Evaluation", "Run", "evaluate", "load", "train", "train_seeds"),
+    "api": ("Evaluation", "Run", "evaluate", "train", "train_seeds"),
     "config": ("Config",),
     "data": ("ReplayBuffer", "Trajectory"),
     "errors": (
@@ -83,6 +83,7 @@ _HOME = {
     "report.dynamics": ("plot_dynamics",),
     "report.page.build": ("write_report",),
     "report.recording": ("Recording", "record"),
+    "service": ("load",),
     "sim_params": ("SimParamSets",),
     "storage.run_dir": ("RunDir",),
     "storage.tables": ("EpisodeRow",),

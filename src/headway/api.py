@@ -1,4 +1,4 @@
-"""What most users need: train, evaluate, load."""
+"""What most users need: train, evaluate; `headway.service` loads."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
@@ -8,14 +8,14 @@ from typing import Any, overload
 from headway.config import Config
 from headway.errors import ConfigError, shown
 from headway.experiment.evaluation import PlanningCost, episode_rows
-from headway.experiment.loading import load_agent
-from headway.experiment.methods import config_to_control, make_config
+from headway.experiment.methods import make_config
 from headway.experiment.progress import Progress
 from headway.experiment.seeds import train_seeds as train_together
 from headway.experiment.testing import run_tests
 from headway.experiment.training import train_run
 from headway.planning.controller import Controller
 from headway.report.figures import save_run_figures
+from headway.service import load
 from headway.storage.run_dir import RunDir
 from headway.storage.tables import EpisodeRow
 
@@ -206,33 +206,6 @@ def evaluate(
     rows = episode_rows(tested.config, tested.iteration, tested.trajectories)
     cost = PlanningCost.of(tested.use, tested.config, tested.arena.task)
     return Evaluation(rows, tested.config, cost)
-
-
-def load(
-    run_dir: str | Path,
-    *,
-    seed: int = 0,
-    settings: Mapping[str, Any] | None = None,
-    **options: Any,
-) -> Controller:
-    """Load the controller of a run.
-
-    Args:
-        run_dir: The run directory.
-        seed: Seeds the planner's draws.
-        settings: Changes of `planner` settings by dotted name, for example
-            `{"planner.num_candidates": 50}`, to control with another planner.
-        options: Those of `Controller`, for example `deadline_ms=50`.
-
-    Raises:
-        RunError: There is no trained run, or it is damaged.
-        ConfigError: A setting is unknown, of the wrong type or out of range, or none of the
-            planner's; or as `Controller`.
-        LimitError: The model needs more memory than is free.
-    """
-    run = RunDir(run_dir)
-    config = config_to_control(run.config(), settings or {})
-    return Controller(load_agent(run, config), seed=seed, **options)
 
 
 def default_run_dir(config: Config) -> Path:

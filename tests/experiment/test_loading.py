@@ -2,6 +2,8 @@
 
 import dataclasses
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -79,3 +81,11 @@ def test_a_file_that_a_copy_lacks_is_named(missing, root):
 def test_learning_on_needs_the_data_as_well(root):
     with pytest.raises(RunError, match="data/iteration-000"):
         headway.load(copy_of(root, SERVED), settings={"planner.adaptation": "last-layer"})
+
+
+def test_a_controller_is_loaded_without_a_simulator(root):
+    code = f"import headway, sys; headway.load({str(root)!r}); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert "headway.planning.controller" in loaded
+    assert not {"gymnasium", "mujoco", "matplotlib", "headway.envs"} & loaded
