@@ -75,6 +75,15 @@ class Recorder:
             raise _NotRepeatableError
         return self._choices[self._step - 1]
 
+    def check_repeated(self) -> None:
+        """Make sure that the episodes did not end before the actions of the earlier attempt.
+
+        Raises:
+            _NotRepeatableError: They did.
+        """
+        if self._step < self._known:
+            raise _NotRepeatableError
+
     def _part(self) -> Part:
         made = {
             name: np.stack([getattr(choice, name) for choice in self._choices]) for name in _KEPT
@@ -136,20 +145,24 @@ def resumable_episodes(
         return _restore(part, len(episodes), store.path(name))
     tape = f"{name}-actions"
 
-    def policy() -> Policy:
-        made = make_policy()
-        # Random actions are as quick to draw again.
-        return Recorder(made, store, tape) if isinstance(made, AgentPolicy) else made
-
     def after_step(steps: int) -> None:
         on_step(steps)
         store.stop_if_asked()
 
+    def run() -> Rollout:
+        policy = make_policy()
+        if not isinstance(policy, AgentPolicy):  # random actions are as quick to draw again
+            return run_episodes(arena, episodes, policy, after_step)
+        recorder = Recorder(policy, store, tape)
+        rollout = run_episodes(arena, episodes, recorder, after_step)
+        recorder.check_repeated()
+        return rollout
+
     try:
-        rollout = run_episodes(arena, episodes, policy(), after_step)
+        rollout = run()
     except _NotRepeatableError:
         store.drop(tape)
-        rollout = run_episodes(arena, episodes, policy(), after_step)
+        rollout = run()
     store.drop(tape)
     store.offer(name, lambda: _finished(rollout))
     return rollout
