@@ -207,6 +207,25 @@ def test_damaged_parts_are_reported_and_done_again(reference, tmp_path):
     assert killing.result(path) == killing.result(reference)
 
 
+def test_parts_that_another_version_kept_are_done_again(reference, tmp_path, monkeypatch):
+    path = tmp_path / "run"
+    with pytest.raises(Terminated):  # in the middle of the second test
+        training.train_run(killing.tiny_config(), path, Signalling(signal.SIGTERM, 34))
+    load, read = progress_store.ProgressStore.load, []
+
+    def other_names(self, name):
+        part = load(self, name)
+        if part is not None:
+            read.append(name)
+            return part._replace(arrays={f"old.{n}": part.arrays[n] for n in part.arrays})
+        return None
+
+    monkeypatch.setattr(progress_store.ProgressStore, "load", other_names)
+    training.train_run(killing.tiny_config(), path)
+    assert read == ["collect", "fit", "evaluate-0-actions"]
+    assert killing.result(path) == killing.result(reference)
+
+
 def test_an_environment_that_does_not_repeat_itself_begins_the_episodes_anew(tmp_path, monkeypatch):
     path = tmp_path / "run"
     with pytest.raises(Terminated):  # in the middle of the second collection
