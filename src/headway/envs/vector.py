@@ -116,7 +116,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if restart.any():
             nothing = [{}] * self.num_envs
             self._start(np.flatnonzero(restart), [None] * self.num_envs, nothing)
-        broken = {int(i): self._broken[i] for i in np.flatnonzero(restart) if i in self._broken}
+        broken = {i: why for i, why in self._broken.items() if restart[i]}
         active = np.flatnonzero(~self._finished & ~restart)
         broken |= self._follow_schedules(active)
         active = np.setdiff1d(active, list(broken))
