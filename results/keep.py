@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 
 from headway.experiment.methods import make_config
-from headway.storage.run_dir import TABLES, RunDir
+from headway.storage.run_dir import RunDir
+from headway.storage.tables import TABLES
 
 
 def keep(run: RunDir, folder: Path) -> Path:

@@ -17,7 +17,11 @@ import headway
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-DOCS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+DOCS = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted((ROOT / "results").rglob("README.md")),
+]
 HEAVY = {"gymnasium", "matplotlib", "mujoco", "ray", "tensorboardX"}
 FOLDERS = "benchmarks|docs|examples|results|src|tests"
 

@@ -1,6 +1,8 @@
 """What the README and the guides show works as it stands there."""
 
 import re
+import sys
+import types
 from pathlib import Path
 
 import gymnasium
@@ -9,6 +11,8 @@ import numpy as np
 import pytest
 
 import headway
+from headway.cli import main
+from headway.settings import setting_names
 from headway.tasks import catalog
 
 ROOT = Path(__file__).parent.parent
@@ -47,25 +51,133 @@ class Cart(gymnasium.Env):
         return self.state.astype(np.float32), reward, False, False, {}
 
 
-@pytest.fixture
-def cart(monkeypatch):
-    monkeypatch.setattr(catalog, "_SPECS", dict(catalog._SPECS))
-    gymnasium.register("my_package/Cart-v0", Cart)
-    yield
-    del gymnasium.registry["my_package/Cart-v0"]
-
-
-@pytest.mark.usefixtures("cart")
-def test_own_environment_guide(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+@pytest.fixture(scope="module")
+def guide(tmp_path_factory):
+    """What the guide to own environments defines, its run small; its folder is the current one."""
     (code,) = python_blocks("docs/own-environment.md")
     names: dict = {}
-    exec(compile(code.replace('"quick"', '"smoke"'), "own-environment.md", "exec"), names)
-    run = names["run"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(catalog, "_SPECS", dict(catalog._SPECS))
+        patch.chdir(tmp_path_factory.mktemp("guide"))
+        gymnasium.register("my_package/Cart-v0", Cart)
+        exec(compile(code.replace('"quick"', '"smoke"'), "own-environment.md", "exec"), names)
+        del gymnasium.registry["my_package/Cart-v0"]  # acting must do without
+        yield names
+
+
+def test_own_environment_guide(guide):
+    run = guide["run"]
     assert {row.group for row in run.evaluation} == {"train", "heavy"}
     obs = np.array([0.5, 0.0], np.float32)
-    action = headway.load(run.path).act(obs)
-    assert action.shape == (1,)
-    assert np.abs(action) <= 3
     task = headway.env_spec("cart").make_task()
     assert jnp.isclose(task.reward(obs, jnp.array([1.0]), jnp.array([0.5, 0.1])), -0.26)
+
+
+class Machine:
+    """The machine that docs/controller.md serves: a cart whose sensor fails."""
+
+    def __init__(self, readings):
+        self.readings, self.sent, self.stopped = iter(readings), [], False
+
+    def read(self):
+        return next(self.readings)
+
+    def send(self, action):
+        self.sent.append(action)
+
+    def stop(self):
+        self.stopped = True
+
+    def wait_for_next_period(self):
+        pass
+
+
+@pytest.mark.usefixtures("guide")
+def test_controller_guide(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "my_package", types.ModuleType("my_package"))
+    service, cheaper = python_blocks("docs/controller.md")
+    service = service.replace("-quick-", "-smoke-").replace("deadline_ms=80", "deadline_ms=6e4")
+    names: dict = {}
+    exec(compile(service, "controller.md", "exec"), names)
+
+    seen = np.array([0.5, 0.0])
+    machine = Machine([seen, None, None, seen, [1e6, 0.0], *4 * [None]])
+    assert names["serve"](machine, 20).startswith("obs[0] is nan")  # a horizon of 4 holds for 3
+    assert machine.stopped
+    sent = np.stack(machine.sent)
+    assert sent.shape == (8, 1)
+    assert sent.dtype == np.float32
+    assert (np.abs(sent) <= 3).all()
+    told = [line.split()[:2] for line in capsys.readouterr().out.splitlines()]
+    held = [["1", "held"], ["2", "held"]]
+    assert told == [*held, ["4", "planned"], *([str(step), "held"] for step in (5, 6, 7))]
+
+    # Without a deadline nothing is compiled here.
+    exec(compile(cheaper.replace("deadline_ms=80", ""), "controller.md", "exec"), names)
+    assert names["controller"].agent.planner.num_candidates == 50
+
+
+def table_rows(path: str, heading: str) -> list[list[str]]:
+    """The cells of the first table under a heading."""
+    section = ("\n" + (ROOT / path).read_text()).partition(f"\n{heading}\n")[2]
+    table = re.search(r"(?:^\|.*\n)+", section, re.MULTILINE)
+    assert table is not None
+    lines = table.group().splitlines()[2:]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+@pytest.mark.parametrize(("preset", "column"), [("paper", 2), ("quick", 4)])
+def test_the_numbers_of_the_presets_are_those_of_the_page(preset, column):
+    config = headway.make_config("half-cheetah", preset=preset)
+    checked = 0
+    for cells in table_rows("docs/reproduce.md", "## The paper's numbers"):
+        told = {float(number) for number in re.findall(r"[\d.]+", cells[column] or cells[2])}
+        for name in re.findall(r"`([a-z_.]+)`", cells[1]):
+            section, _, field = name.partition(".")
+            values = np.atleast_1d(getattr(getattr(config, section), field))
+            assert set(values.tolist()) <= told, f"{name} is {values} with {preset}"
+            checked += 1
+    assert checked > 20
+
+
+def test_the_table_of_methods_has_every_method_once():
+    cells = [row[0] for row in table_rows("docs/methods.md", "# Methods")]
+    assert sorted(re.findall(r"\[`([\w-]+)`\]", " ".join(cells))) == sorted(headway.METHODS)
+
+
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "results").rglob("README.md")),
+]
+COMMANDS = [
+    "train",
+    "evaluate",
+    "record",
+    "report",
+    "diagnose",
+    "reproduce",
+    "sweep",
+    "plot-dynamics",
+]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_options_that_the_pages_show_exist(command, capsys):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    offered = set(re.findall(r"--[a-z][\w.-]*\w", capsys.readouterr().out))
+    for page in PAGES:
+        text = re.sub(r"\\\n\s*", " ", page.read_text())
+        for shown in re.findall(rf"headway {command} ([^`\n#]*)", text):
+            unknown = set(re.findall(r"--[a-z][\w.-]*\w", shown)) - offered
+            assert not unknown, f"{page.name} shows headway {command} with {unknown}"
+
+
+def test_settings_that_the_pages_name_exist():
+    known = setting_names(headway.make_config("pendulum"))
+    for page in PAGES:
+        named = re.findall(
+            r"`((?:model|fitting|planner|collection|evaluation)\.(?!csv)[a-z_]+)", page.read_text()
+        )
+        assert set(named) <= set(known), page.name

@@ -1,22 +1,26 @@
 """Scores of trained runs with and without heads that keep learning, per physics.
 
     python results/adaptation/measure.py runs/pendulum-0 --table results/adaptation/pendulum.csv
+    python results/adaptation/measure.py runs/reproduce/runs/pendulum/*/seed* --folder results/NAME
 
 Every arm meets the same test episodes. Rows are written as soon as an arm is tested, and what the
-table holds already is skipped, so the same command goes on where it was interrupted.
+table holds already is skipped, so the same command goes on where it was interrupted. A run tested
+as it was in training has its results already: they are read, not made again.
 """
 
 import argparse
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import headway
 from headway.experiment.progress import make_progress
 from headway.report.tables import by_physics
+from headway.settings import override
 from headway.storage.records import read_csv, write_csv
 from headway.storage.run_dir import RunDir
+from headway.storage.tables import EVALUATION_COLUMNS, EpisodeRow
 
 COLUMNS = (
     "run", "env", "method", "seed", "arm", "group", "sim_params", "settings", "episodes",
@@ -55,12 +59,28 @@ def measure(
         "seed": found.config.seed,
         "seconds_per_step": found.cost.seconds_per_step,
     }
+    return [shared | part for part in rows_of(found)]
+
+
+def tested_in_training(run_dir: Path) -> list[dict[str, Any]]:
+    """What the run itself found after its last iteration; one row per physics."""
+    table = [
+        EpisodeRow.from_csv(r) for r in read_csv(run_dir / "evaluation.csv", EVALUATION_COLUMNS)
+    ]
+    last = max(row.iteration for row in table)
+    config = RunDir(run_dir).config()
+    shared = {"env": config.env, "method": config.method, "seed": config.seed}
+    shared["seconds_per_step"] = ""
+    return [shared | part for part in rows_of([row for row in table if row.iteration == last])]
+
+
+def rows_of(episodes: Sequence[EpisodeRow]) -> list[dict[str, Any]]:
+    """One row per physics."""
     rows = []
-    for part in by_physics(found):
+    for part in by_physics(episodes):
         score = "" if part["score"] is None else part["score"]
         kept = {name: part[name] for name in ("group", "episodes", "return_mean", "return_std")}
-        sim_params = json.dumps(part["sim_params"])
-        rows.append({**shared, **kept, "score": score, "sim_params": sim_params})
+        rows.append({**kept, "score": score, "sim_params": json.dumps(part["sim_params"])})
     return rows
 
 
@@ -68,7 +88,9 @@ def main() -> None:
     """Measure what the table lacks."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("runs", type=Path, nargs="+", help="directories of trained runs")
-    parser.add_argument("--table", type=Path, required=True, help="CSV file to add rows to")
+    place = parser.add_mutually_exclusive_group(required=True)
+    place.add_argument("--table", type=Path, help="CSV file to add rows to")
+    place.add_argument("--folder", type=Path, help="for one CSV file per run")
     parser.add_argument("--arms", nargs="+", default=["none", "last-layer"], choices=list(ARMS))
     parser.add_argument("--groups", nargs="+", help="all by default")
     parser.add_argument("--episodes", type=int, help="per group; the run's own number by default")
@@ -77,8 +99,14 @@ def main() -> None:
     for run in asked.runs:
         episodes = asked.episodes or RunDir(run).config().evaluation.num_episodes
         shared = {"planner.precision": asked.precision, "evaluation.num_episodes": episodes}
+        table = asked.table or asked.folder / f"{name_of(run)}.csv"
         for arm in asked.arms:
-            add(asked.table, arm, run, {**ARMS[arm], **shared}, asked.groups)
+            add(table, arm, run, {**ARMS[arm], **shared}, asked.groups)
+
+
+def name_of(run: Path) -> str:
+    """The directory's name; of a seed in a sweep, with the method and settings it belongs to."""
+    return f"{run.parent.name}-{run.name}" if run.name.startswith("seed") else run.name
 
 
 def add(
@@ -86,16 +114,21 @@ def add(
 ) -> None:
     """Measure one arm and write its rows, unless the table has them."""
     rows: list[Mapping[str, Any]] = [*read_csv(table, COLUMNS)]
-    place = {"run": run.name, "arm": arm, "settings": json.dumps(settings)}
+    place = {"run": name_of(run), "arm": arm, "settings": json.dumps(settings)}
     for old in rows:
-        if (old["run"], old["arm"]) == (run.name, arm):
+        if (old["run"], old["arm"]) == (place["run"], arm):
             if old["settings"] != place["settings"]:
                 raise SystemExit(f"{place} was measured with {old['settings']}; use a new table.")
             return
-    found = [place | row for row in measure(run, settings, groups)]
+    own = RunDir(run).config()
+    if groups is None and override(own, settings) == own:
+        parts = tested_in_training(run)
+    else:
+        parts = measure(run, settings, groups)
+    found = [place | part for part in parts]
     write_csv(table, COLUMNS, [*rows, *found])
     for row in found:
-        print(run.name, arm, row["sim_params"], row["score"], flush=True)
+        print(place["run"], arm, row["sim_params"], row["score"], flush=True)
 
 
 if __name__ == "__main__":

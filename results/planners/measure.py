@@ -23,6 +23,7 @@ from headway.experiment.progress import make_progress
 from headway.report.tables import by_physics
 from headway.storage.records import read_csv, write_csv
 from headway.storage.run_dir import RunDir
+from headway.tasks.catalog import sim_param_sets
 
 COLUMNS = (
     "run", "env", "planner", "physics", "settings", "episodes", "score", "return_mean",
@@ -119,7 +120,7 @@ def measure(run_dir: Path, settings: Settings, groups: list[str]) -> Settings:
 
 def physics_groups(config: Config) -> dict[str, list[str]]:
     """Training physics, and all unseen ones together."""
-    train, *unseen = (config.sim_params or headway.env_spec(config.env).sim_params).group_names
+    train, *unseen = sim_param_sets(config).group_names
     return {"training": [train], "unseen": unseen}
 
 

@@ -4,9 +4,9 @@ import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
-from headway.report.comparison import write_raw, write_table
-from headway.report.comparison_figure import draw_comparison
-from headway.report.comparison_runs import Found, find
+from headway.report.comparison.figure import draw_comparison
+from headway.report.comparison.runs import Found, find
+from headway.report.comparison.writing import write_raw, write_table
 from headway.sweeps.board import Board
 from headway.sweeps.jobs import Comparison
 from headway.sweeps.running import Workers, run_jobs

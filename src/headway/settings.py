@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 from headway.config import Config
+from headway.config.unused import unused_settings
 from headway.errors import ConfigError, shown
 from headway.sim_params import SimParamSets
 
@@ -71,9 +72,26 @@ def setting_names(config: Config) -> list[str]:
     return names
 
 
+def relevant(config: Config, usual: Config | None = None) -> dict[str, Any]:
+    """Every setting by dotted name, those that the run cannot use as they usually are.
+
+    Two configurations whose relevant settings are equal make the same run.
+
+    Args:
+        config: The settings of the run.
+        usual: Gives the values of what the run cannot use; the defaults do, if it is None.
+    """
+    flat = flatten(to_dict(config))
+    instead = flatten(to_dict(usual or Config(env=config.env)))
+    return flat | {name: instead[name] for name in unused_settings(config)}
+
+
 def differences(old: Config, new: Config) -> list[str]:
-    """Return one line per setting that differs, for people to read."""
-    before, after = flatten(to_dict(old)), flatten(to_dict(new))
+    """Return one line per setting that differs, for people to read; none where runs are the same.
+
+    What a run cannot use does not count (`relevant`).
+    """
+    before, after = relevant(old), relevant(new)
     return [
         f"{name}: {shown(before.get(name))} -> {shown(after.get(name))}"
         for name in sorted({*before, *after})

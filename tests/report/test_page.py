@@ -159,6 +159,19 @@ def test_what_is_tolerated_of_an_environment_makes_no_variant(tmp_path, write_ru
     ]
 
 
+def test_settings_that_a_run_cannot_use_make_no_variants(tmp_path, write_run):
+    for seed, transitions in ((0, 0), (1, 20)):
+        changed = {"fitting.relation_transitions": transitions, "planner.temperature": 1.0 + seed}
+        write_run(tmp_path / f"seed{seed}", seed=seed, settings_changed=changed)
+    changed = {"planner.temperature": 9.0}
+    write_run(tmp_path / "seed1-again", seed=1, settings_changed=changed)
+    runs, notes = load_runs([tmp_path])
+    assert series_labels(runs) == ["tmcl", "tmcl"]
+    assert [note.run.name for note in notes] == ["seed1-again"]
+    page = write_report([tmp_path], tmp_path / "report.html", only=["settings"]).read_text()
+    assert "All runs have the same settings." in page
+
+
 def test_a_run_is_not_counted_twice(folder, tmp_path):
     shutil.copytree(folder / "tmcl-0", tmp_path / "copy")
     runs, notes = load_runs([tmp_path / "copy", folder, folder / "tmcl-0"])

@@ -11,7 +11,7 @@ from headway.storage.run_dir import RunDir
 from headway.storage.tables import EpisodeRow
 from headway.sweeps.board import Board
 from headway.sweeps.jobs import Job
-from headway.tasks.catalog import env_spec
+from headway.tasks.catalog import sim_param_sets
 
 TINY = {
     "collection.episode_length": 6,
@@ -73,7 +73,7 @@ def write_run(config, path, progress=None):
     content = {"schema": 1, "config": settings.to_dict(config)}
     (path / "config.json").write_text(json.dumps(content))
     run = RunDir(path)
-    sets = config.sim_params or env_spec(config.env).sim_params
+    sets = sim_param_sets(config)
     rows = []
     for i in range(config.collection.num_iterations):
         returns = [level(config, i) - 1, level(config, i) + 1]

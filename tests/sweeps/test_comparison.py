@@ -14,10 +14,10 @@ from headway.cli import main
 from headway.cli.comparisons import read_seeds, read_settings
 from headway.cli.usage import UsageError
 from headway.compare import reproduce
-from headway.report.comparison import spread
-from headway.report.comparison_figure import _curves, arm_styles, has_curves
-from headway.report.comparison_runs import Found, Point, find
-from headway.report.comparison_statistics import verdicts
+from headway.report.comparison.figure import _curves, arm_styles, has_curves
+from headway.report.comparison.runs import Found, Point, find
+from headway.report.comparison.verdicts import verdicts
+from headway.report.comparison.writing import spread
 from headway.storage.run_dir import RunDir
 from headway.sweeps import running
 from headway.sweeps.experiments import EXPERIMENTS, experiment

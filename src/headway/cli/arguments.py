@@ -18,8 +18,8 @@ from headway.config import (
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 
 
-def _unset(text: str):
-    """What help says of an option that is not given."""
+def default_text(text: str):
+    """What help says of the default of an option, in words."""
     return tyro.conf.arg(help_behavior_hint=f"(default: {text})")
 
 
@@ -106,11 +106,11 @@ class Train:
         tyro.conf.arg(metavar="SEED|FROM:TO", help_behavior_hint="(default: only --seed)"),
     ] = ()
     """Seeds that are trained together in one program, each as a run of its own: 0:3 is 0 1 2."""
-    run_dir: Annotated[Path | None, _unset("runs/ENV-METHOD-PRESET-seedSEED")] = None
+    run_dir: Annotated[Path | None, default_text("runs/ENV-METHOD-PRESET-seedSEED")] = None
     """Where everything is written; with --seeds, a folder with a directory seedSEED for each."""
-    sim_params: Annotated[Path | None, _unset("the environment's own")] = None
+    sim_params: Annotated[Path | None, default_text("the environment's own")] = None
     """A JSON file with the training and unseen physics."""
-    env_options: Annotated[tuple[str, ...], _unset("those of the preset")] = ()
+    env_options: Annotated[tuple[str, ...], default_text("those of the preset")] = ()
     """Switches of the environment: NAME or NAME=on turns one on, NAME=off turns it off."""
     resume_from_last_good: Flag = False
     """Where a file of the run is damaged, go back to the newest iteration that is intact."""
@@ -142,9 +142,9 @@ class Evaluate:
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """The run directory."""
-    group: Annotated[tuple[str, ...], _unset("all of them")] = ()
+    group: Annotated[tuple[str, ...], default_text("all of them")] = ()
     """Groups of physics: `train` or unseen groups."""
-    episodes: Annotated[int | None, _unset("as in the run's own tests")] = None
+    episodes: Annotated[int | None, default_text("as in the run's own tests")] = None
     """Episodes per group; the same as --evaluation.num-episodes."""
     json: Flag = False
     """Print one JSON line on stdout instead of tables."""
@@ -169,13 +169,13 @@ class Record:
     """The run directory."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("episode.gif")
     """The file to write; .gif or .webp."""
-    sim_params: Annotated[tuple[str, ...], _unset("drawn from the training physics")] = ()
+    sim_params: Annotated[tuple[str, ...], default_text("drawn from the training physics")] = ()
     """Physics, for example length=1.75."""
-    schedule: Annotated[tuple[str, ...], _unset("physics stay")] = ()
+    schedule: Annotated[tuple[str, ...], default_text("physics stay")] = ()
     """Physics that change during the episode, for example 60:length=0.5 120:length=1."""
     seed: int = 0
     """Seeds the start and the planner."""
-    steps: Annotated[int | None, _unset("a full episode")] = None
+    steps: Annotated[int | None, default_text("a full episode")] = None
     """Steps to film."""
     json: Flag = False
     """Print one JSON line on stdout instead of text."""
@@ -199,7 +199,7 @@ class Report:
     """Run directories, or folders that hold some; any methods, environments and seeds."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("report.html")
     """The HTML file to write."""
-    only: Annotated[tuple[str, ...], _unset("all of them")] = ()
+    only: Annotated[tuple[str, ...], default_text("all of them")] = ()
     """Chapters to make, for example `learning-curves` or `contexts`."""
     json: Flag = False
     """Print one JSON line on stdout instead of text."""
@@ -214,9 +214,9 @@ class Diagnose:
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """The run directory."""
-    group: Annotated[tuple[str, ...], _unset("all of them")] = ()
+    group: Annotated[tuple[str, ...], default_text("all of them")] = ()
     """Groups of physics: `train` or unseen groups."""
-    episodes: Annotated[int | None, _unset("as in the run's own tests")] = None
+    episodes: Annotated[int | None, default_text("as in the run's own tests")] = None
     """Episodes per group."""
     collected: Flag = False
     """Take the episodes that the last iteration collected instead of running tests: done at once,

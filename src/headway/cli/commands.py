@@ -119,10 +119,11 @@ def evaluate(words: Sequence[str]) -> int:
 def list_names(words: Sequence[str]) -> int:
     """`headway list`."""
     arguments = parse(List, List(what=tyro.MISSING), words, "headway list")
-    from headway.report import comparison_tables, tables
+    from headway.report import tables
+    from headway.report.comparison import terminal
 
     found = {"envs": tables.envs, "methods": tables.methods, "presets": tables.presets}
-    found["experiments"] = comparison_tables.experiments
+    found["experiments"] = terminal.experiments
     entries, table = found[arguments.what]()
     if arguments.json:
         return _print_json({arguments.what: entries})

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from headway.cli.arguments import Flag
-from headway.cli.arguments import _unset as unset
+from headway.cli.arguments import Flag, default_text
 from headway.cli.output import print_json, print_tables
 from headway.cli.seeds import read_seeds
 from headway.cli.usage import UsageError, parse
@@ -29,7 +28,7 @@ PAPER_ENVS = (
 class _Runs:
     """Options of both commands."""
 
-    envs: Annotated[tuple[str, ...], unset("the paper's six")] = PAPER_ENVS
+    envs: Annotated[tuple[str, ...], default_text("the paper's six")] = PAPER_ENVS
     """Environments; `headway list envs` shows them."""
     seeds: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SEED|FROM:TO")] = ("0:3",)
     """Seeds, or ranges without their end: 0:3 is 0 1 2."""
@@ -44,11 +43,11 @@ class _Runs:
     seeds_together: Flag = False
     """Train the seeds of each configuration in one program, in this process and without Ray; on a
     GPU small networks gain by it."""
-    address: Annotated[str | None, unset("Ray on this machine")] = None
+    address: Annotated[str | None, default_text("Ray on this machine")] = None
     """A Ray cluster, for example `auto`; it must see --out under the same path."""
     cpus_per_run: float = 1.0
     """Cores that one run reserves, and threads that it computes with."""
-    gpus_per_run: Annotated[float | None, unset("1 where there are GPUs")] = None
+    gpus_per_run: Annotated[float | None, default_text("1 where there are GPUs")] = None
     """GPUs that one run reserves; a fraction lets several share one."""
     json: Flag = False
     """Print one JSON line on stdout instead of tables."""
@@ -66,7 +65,10 @@ class _Experiment:
 
 @dataclasses.dataclass(frozen=True)
 class Reproduce(_Runs, _Experiment):
-    """Run what is missing of an experiment of the paper, and draw and tabulate it."""
+    """Run what is missing of an experiment of the paper, and draw and tabulate it.
+
+    The figure compares the runs; `headway report OUT/runs` shows what is inside each of them.
+    """
 
     settings: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
     """Settings of every arm, for example collection.num_iterations=3."""
@@ -74,7 +76,10 @@ class Reproduce(_Runs, _Experiment):
 
 @dataclasses.dataclass(frozen=True)
 class Sweep(_Runs):
-    """Run methods in environments with seeds and settings, all of them with each other."""
+    """Run methods in environments with seeds and settings, all of them with each other.
+
+    The figure compares the runs; `headway report OUT/runs` shows what is inside each of them.
+    """
 
     methods: tuple[str, ...] = ("tmcl",)
     """Methods; `headway list methods` shows them."""
@@ -145,7 +150,7 @@ def _compare(
     if arguments.json:
         print_json(_facts(done))
     else:
-        from headway.report.comparison_tables import results
+        from headway.report.comparison.terminal import results
 
         print_tables(*results(done.found))
         print("Written:", *done.files, sep="\n  ")
@@ -165,7 +170,7 @@ def _facts(done: Any) -> dict[str, Any]:
 
 
 def _print_plan(comparison: "Comparison", as_json: bool) -> int:
-    from headway.report.comparison_tables import plan
+    from headway.report.comparison.terminal import plan
     from headway.sweeps.cost import make_plan
 
     entries, table = plan(comparison, make_plan(comparison.jobs))

@@ -11,7 +11,7 @@ from typing import Any
 from headway.config import PLAIN, Config
 from headway.errors import ConfigError, unknown_name
 from headway.settings import TOLERANCE, override, setting_names
-from headway.tasks.catalog import EnvSpec, env_spec, episode_length
+from headway.tasks.catalog import EnvSpec, env_spec, episode_length, sim_param_sets
 
 Settings = Mapping[str, Any]
 
@@ -29,7 +29,11 @@ class Method:
 
 @dataclasses.dataclass(frozen=True)
 class Preset:
-    """A scale of experiment; `settings` may depend on the environment."""
+    """A scale of experiment; `settings` may depend on the environment.
+
+    What only some methods can use belongs in their `Method.by_preset`: whatever a preset sets is
+    in the directory names of all its runs (`headway.sweeps.jobs.fingerprint`).
+    """
 
     name: str
     description: str
@@ -340,7 +344,7 @@ def told_sim_params(config: Config) -> tuple[str, ...]:
     """The simulator parameters that the model is told, by name; none but with `sim-params`."""
     if config.model.context != "sim-params":
         return ()
-    return (config.sim_params or env_spec(config.env).sim_params).names
+    return sim_param_sets(config).names
 
 
 def check_options(config: Config) -> None:

@@ -23,7 +23,7 @@ from headway.planning.acting import Acting
 from headway.planning.controller import env_action
 from headway.sim_params import SimParamSets
 from headway.tasks.base import Task
-from headway.tasks.catalog import EnvSpec, env_options, env_spec, episode_length
+from headway.tasks.catalog import EnvSpec, env_options, env_spec, episode_length, sim_param_sets
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Arena:
         options = env_options(config)
         task = spec.make_task(**options)
         length = episode_length(config)
-        sim_params = config.sim_params or spec.sim_params
+        sim_params = sim_param_sets(config)
         vector = envs.make_vec(
             config.env,
             collection.num_episodes,

@@ -6,18 +6,18 @@ much of them counts. Whatever an interrupted iteration left behind is written ag
 """
 
 import contextlib
-import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from headway import settings
 from headway.config import Config
 from headway.data import Trajectory
-from headway.errors import ConfigError, HeadwayError, RunError
+from headway.errors import ConfigError, RunError
 from headway.storage import config_file, files, records
 from headway.storage.config_file import SCHEMA, UNCHECKED
 from headway.storage.interrupts import StopRequest
+from headway.storage.iterations import Iterations, checkpoint_name, manifest_name, number
 from headway.storage.manifest import Digest, Manifest, inside
 from headway.storage.progress_store import ProgressStore
 from headway.storage.run_lock import LOCK, locked
@@ -31,9 +31,8 @@ from headway.storage.tables import (
     typed_row,
 )
 
-KEPT = 2  # checkpoints, so that there is one to go back to
-TABLES = ("metrics.jsonl", "evaluation.csv", "assignments.csv", "prediction_error.csv")
 PARTIAL = "partial"
+FOLDERS = ("checkpoints", "data", "manifests", PARTIAL, "figures", "tensorboard")
 
 
 class RunDir:
@@ -45,6 +44,7 @@ class RunDir:
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
+        self._iterations = Iterations(self.path)
 
     @property
     def figures(self) -> Path:
@@ -53,9 +53,9 @@ class RunDir:
 
     def partial(self, stop: StopRequest) -> ProgressStore:
         """The finished parts of the iteration after the last finished one."""
-        numbers = self._manifest_numbers()
+        numbers = self._iterations.numbers
         next_iteration = numbers[-1] + 1 if numbers else 0
-        names = ["config.json", *map(_manifest_name, numbers[-1:])]
+        names = ["config.json", *map(manifest_name, numbers[-1:])]
         origin = " ".join(Digest.of(inside(self.path, name)).sha256 for name in names)
         return ProgressStore(inside(self.path, PARTIAL), next_iteration, origin, stop)
 
@@ -123,13 +123,13 @@ class RunDir:
         """
         manifest = self.manifest()
         if manifest is not None:
-            with self._advice():
+            with self._iterations.advice():
                 manifest.check(self.path)
         self.evaluation()
         self.assignments()
         self.prediction_errors()
         finished = self.finished_iterations
-        beyond = [path for path in self._iteration_files("checkpoints") if _number(path) > finished]
+        beyond = [path for path in self._iterations.files("checkpoints") if number(path) > finished]
         if beyond:
             place = "manifests" if self._schema == SCHEMA else "metrics.jsonl"
             raise RunError(
@@ -182,7 +182,7 @@ class RunDir:
 
     def checkpoint(self, iteration: int) -> Path:
         """The file with the networks, optimiser and statistics after an iteration."""
-        return inside(self.path, _checkpoint_name(iteration))
+        return inside(self.path, checkpoint_name(iteration))
 
     def checked_checkpoint(self, iteration: int) -> Path:
         """The same file, which is as it was written.
@@ -192,8 +192,8 @@ class RunDir:
         """
         manifest = self.manifest()
         if manifest is not None:
-            with self._advice():
-                manifest.check(self.path, ["config.json", _checkpoint_name(iteration)])
+            with self._iterations.advice():
+                manifest.check(self.path, ["config.json", checkpoint_name(iteration)])
         return self.checkpoint(iteration)
 
     def save_data(self, iteration: int, trajectories: list[Trajectory]) -> None:
@@ -210,11 +210,7 @@ class RunDir:
 
     def finish(self, iteration: int) -> None:
         """Make an iteration count, once all its files are written."""
-        previous = self.manifest()
-        known = {} if previous is None else previous.files
-        old = {name: digest for name, digest in known.items() if name.startswith("data/")}
-        new = self._digests(iteration, range(iteration, iteration + 1))
-        Manifest(iteration, {**old, **new}).write(self._manifest_path(iteration))
+        self._iterations.finish(iteration)
         self.tidy()
 
     def manifest(self) -> Manifest | None:
@@ -223,19 +219,13 @@ class RunDir:
         Raises:
             RunError: It is damaged; the message says how to go back.
         """
-        numbers = self._manifest_numbers()
-        if not numbers or self._schema == UNCHECKED:
+        if not self._iterations.numbers or self._schema == UNCHECKED:
             return None
-        with self._advice():
-            return self._read_manifest(numbers[-1])
+        return self._iterations.newest()
 
     def last_good(self) -> int | None:
         """The newest finished iteration whose files are all as they were written."""
-        for iteration in reversed(self._manifest_numbers()):
-            with contextlib.suppress(HeadwayError):
-                self._read_manifest(iteration).check(self.path)
-                return iteration
-        return None
+        return self._iterations.last_good()
 
     def go_back(self) -> int | None:
         """Forget the iterations after the last good one; call it when `locked`.
@@ -246,26 +236,12 @@ class RunDir:
         Raises:
             RunError: No finished iteration is intact.
         """
-        numbers = self._manifest_numbers()
-        good = self.last_good()
-        if good is None and numbers:
-            raise RunError(
-                f"{self.path} has no intact iteration to go back to; restore it from a copy, or"
-                " start anew in another directory."
-            )
-        newer = [number for number in reversed(numbers) if good is not None and number > good]
-        files.remove(self._manifest_path(number) for number in newer)
-        return good
+        return self._iterations.go_back()
 
     def tidy(self) -> None:
         """Delete what is of no use any more: older checkpoints, unfinished files."""
-        numbers = self._manifest_numbers()
-        if numbers:
-            kept = range(numbers[-1] - KEPT + 1, numbers[-1] + 2)
-            for folder in ("manifests", "checkpoints"):
-                found = self._iteration_files(folder)
-                files.remove(path for path in found if _number(path) not in kept)
-        for folder in [self.path, *(inside(self.path, name) for name in _FOLDERS)]:
+        self._iterations.drop_old()
+        for folder in [self.path, *(inside(self.path, name) for name in FOLDERS)]:
             files.remove(list(folder.glob(f".*{files.UNFINISHED}")))
 
     def _is_new(self) -> bool:
@@ -292,28 +268,14 @@ class RunDir:
             self._write_table("evaluation.csv", EVALUATION_COLUMNS, episodes)
             self._write_table("assignments.csv", ASSIGNMENT_COLUMNS, self.assignments())
             self._write_table("prediction_error.csv", PREDICTION_COLUMNS, self.prediction_errors())
-            digests = self._digests(finished - 1, range(finished))
-            digests["config.json"] = Digest.of_bytes(content)
-            Manifest(finished - 1, digests).write(self._manifest_path(finished - 1))
+            self._iterations.finish_all(finished, content)
         files.write_bytes(self.path / "config.json", content)
-
-    def _digests(self, iteration: int, data: range) -> dict[str, Digest]:
-        """The files of an iteration as they are now, with the data of some iterations."""
-        found = [path for path in self._iteration_files("data") if _number(path) in data]
-        names = ["config.json", *TABLES, _checkpoint_name(iteration)]
-        names += [path.relative_to(self.path).as_posix() for path in found]
-        return {name: Digest.of(inside(self.path, name)) for name in names}
-
-    def _iteration_files(self, folder: str) -> list[Path]:
-        """The files of a folder that belong to an iteration, by its number."""
-        found = inside(self.path, folder).glob("iteration-*")
-        return sorted((path for path in found if _number(path) >= 0), key=_number)
 
     def _text(self, name: str) -> bytes:
         """The part of a table that belongs to finished iterations; all of it in schema 1."""
         manifest = self.manifest()
         if manifest is not None:
-            with self._advice():
+            with self._iterations.advice():
                 return manifest.read_text(self.path, name)
         path = inside(self.path, name)
         return files.read_bytes(path) if self._schema == UNCHECKED and path.exists() else b""
@@ -340,49 +302,3 @@ class RunDir:
 
     def _data(self, iteration: int) -> Path:
         return inside(self.path, f"data/iteration-{iteration:03d}")
-
-    def _manifest_path(self, iteration: int) -> Path:
-        return inside(self.path, _manifest_name(iteration))
-
-    def _manifest_numbers(self) -> list[int]:
-        return list(map(_number, self._iteration_files("manifests")))
-
-    def _read_manifest(self, iteration: int) -> Manifest:
-        path = self._manifest_path(iteration)
-        manifest = Manifest.read(path)
-        if manifest.iteration != iteration:
-            raise files.damaged(path, f"it is of iteration {manifest.iteration}")
-        return manifest
-
-    @contextlib.contextmanager
-    def _advice(self) -> Iterator[None]:
-        """Add to an error how to go back."""
-        try:
-            yield
-        except RunError as error:
-            good = self.last_good()
-            advice = (
-                "No earlier iteration is intact; restore the file, or start anew in another"
-                " directory."
-                if good is None
-                else f"The last good iteration is {good}: the run's `headway train` command with"
-                " --resume-from-last-good goes back to it."
-            )
-            raise RunError(f"{error} {advice}") from None
-
-
-_FOLDERS = ("checkpoints", "data", "manifests", PARTIAL, "figures", "tensorboard")
-
-
-def _checkpoint_name(iteration: int) -> str:
-    return f"checkpoints/iteration-{iteration:03d}.safetensors"
-
-
-def _manifest_name(iteration: int) -> str:
-    return f"manifests/iteration-{iteration:03d}.json"
-
-
-def _number(path: Path) -> int:
-    """The iteration that a file belongs to; -1 for a file that is not ours."""
-    found = re.fullmatch(r"iteration-(\d{3,9})\.\w+", path.name)
-    return int(found[1]) if found else -1

@@ -9,6 +9,7 @@ from typing import Any
 from headway.errors import RunError
 from headway.storage.files import damaged
 
+TABLES = ("metrics.jsonl", "evaluation.csv", "assignments.csv", "prediction_error.csv")
 EVALUATION_COLUMNS = (
     "method", "env", "seed", "iteration", "group", "sim_params", "episode", "return", "length",
 )  # fmt: skip

@@ -14,7 +14,7 @@ from headway.storage.run_dir import RunDir
 from headway.sweeps.board import first_status
 from headway.sweeps.jobs import Job
 from headway.sweeps.status import State
-from headway.tasks.catalog import env_spec, episode_length
+from headway.tasks.catalog import episode_length, sim_param_sets
 
 PER_PRODUCT = 3.0  # a run takes about so much longer than its matrix products alone
 _SIZE, _PRODUCTS = 768, 12  # matrices that are multiplied to time this machine
@@ -71,12 +71,11 @@ def run_flop(config: Config, first_iteration: int = 0) -> float:
         config: All settings.
         first_iteration: Iterations before this one are done already.
     """
-    task, spec = load_task(config), env_spec(config.env)
-    length = episode_length(config)
+    task, length = load_task(config), episode_length(config)
     per_step = plan_flop(config.model, config.planner, task)
     # Forwards, and backwards twice as much.
     per_sample = 6.0 * num_parameters(config, task) if config.model.learns else 0.0
-    num_unseen = len((config.sim_params or spec.sim_params).group_names) - 1
+    num_unseen = len(sim_param_sets(config).group_names) - 1
     total = 0.0
     for iteration in range(first_iteration, config.collection.num_iterations):
         collected = config.collection.num_episodes * length

@@ -1,7 +1,7 @@
 """What an experiment needs: one run per arm, environment and seed, each with its directory.
 
-A run's directory is named by its whole configuration, so that whoever needs the same run finds
-it, and two different ones never meet.
+A run's directory is named by every setting that can change its results, so that whoever needs
+the same run finds it, and two different ones never meet.
 """
 
 import dataclasses
@@ -132,17 +132,19 @@ def unique(jobs: Iterable[Job]) -> list[Job]:
 
 
 def fingerprint(config: Config) -> str:
-    """Ten letters that stand for all settings but the seed.
+    """Ten letters that stand for all settings that a run can use, but the seed.
 
     Only what differs from the defaults counts, so a setting that a later version adds does not
-    give the same run another name.
+    give the same run another name. What the run cannot use counts as its method and preset have
+    it, whatever it is here: so it tells no runs apart, and those of before keep their names.
     """
-    plain = Config(env=config.env, method=config.method, preset=config.preset, seed=config.seed)
-    changed = sorted(_lines(config) - _lines(plain))
+    names = {"method": config.method, "preset": config.preset, "seed": config.seed}
+    usual = make_config(config.env, **names)
+    plain = settings.flatten(settings.to_dict(Config(env=config.env, **names)))
+    changed = sorted(_lines(settings.relevant(config, usual)) - _lines(plain))
     return hashlib.sha256("\n".join(changed).encode()).hexdigest()[:10]
 
 
-def _lines(config: Config) -> set[str]:
+def _lines(flat: Settings) -> set[str]:
     """Every setting as one line of text."""
-    flat = settings.flatten(settings.to_dict(config))
     return {f"{name}={json.dumps(value)}" for name, value in flat.items()}

@@ -71,6 +71,11 @@ def env_options(config: Config) -> dict[str, bool]:
     return {**env_spec(config.env).options, **config.env_options}
 
 
+def sim_param_sets(config: Config) -> SimParamSets:
+    """Training and unseen physics: the run's own, or else the environment's."""
+    return config.sim_params or env_spec(config.env).sim_params
+
+
 def register(spec: EnvSpec) -> None:
     """Add an environment of your own, or replace an earlier one of the same name.
 

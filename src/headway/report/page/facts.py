@@ -24,7 +24,7 @@ def settings(comparison: Comparison) -> Section:
     """The settings in which the runs of an environment differ."""
     lead = (
         "Settings that are not the same in all runs of an environment, seeds and what is tolerated"
-        " of environments that break aside. Everything else is equal."
+        " of environments that break aside. Everything else that the runs use is equal."
     )
     blocks = [_settings_of(comparison, env) for env in comparison.envs]
     return Section("settings", "Settings that differ", lead, blocks)

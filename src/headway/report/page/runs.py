@@ -144,7 +144,7 @@ def _without_copies(runs: Sequence[LoadedRun], notes: list[Note]) -> list[Loaded
     kept: list[tuple[Config, LoadedRun]] = []
     for run in runs:
         config = settings.tolerating_as(run.config, runs[0].config)
-        same = next((other for known, other in kept if known == config), None)
+        same = next((o for known, o in kept if not settings.differences(known, config)), None)
         if same is None:
             kept.append((config, run))
         else:

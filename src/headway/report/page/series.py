@@ -136,8 +136,8 @@ def differing_settings(values: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def run_settings(run: LoadedRun) -> dict[str, Any]:
-    """All settings of a run by dotted name."""
-    return settings.flatten(settings.to_dict(run.config))
+    """All settings of a run by dotted name; those that it cannot use stand at their defaults."""
+    return settings.relevant(run.config)
 
 
 def _settings(run: LoadedRun) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from headway.report import statistics
-from headway.report.comparison_runs import Found
+from headway.report.comparison.runs import Found
 
 
 def interquartile(found: Found, env: str, arm: str) -> str:

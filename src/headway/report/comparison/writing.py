@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from headway.report.comparison_runs import COLLECTED, Found
-from headway.report.comparison_statistics import interquartile, verdicts
+from headway.report.comparison.runs import COLLECTED, Found
+from headway.report.comparison.verdicts import interquartile, verdicts
 from headway.report.statistics import MIN_RUNS
 from headway.report.tables import by_group
 from headway.storage import files, records

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from headway.report.comparison_runs import COLLECTED, Found, Point
+from headway.report.comparison.runs import COLLECTED, Found, Point
 from headway.report.style import FAINT, HEADS, INK, figure, legend
 
 COLUMNS = 3

@@ -5,8 +5,8 @@ from typing import Any
 from rich.table import Table
 
 from headway.experiment.progress import duration
-from headway.report.comparison import table_columns, table_rows
-from headway.report.comparison_runs import Found
+from headway.report.comparison.runs import Found
+from headway.report.comparison.writing import table_columns, table_rows
 from headway.report.tables import new_table
 from headway.sweeps.cost import Plan
 from headway.sweeps.experiments import EXPERIMENTS

@@ -1,0 +1,105 @@
+"""Draw, for every method, the scores of frozen heads and of heads that keep learning.
+
+    python results/adaptation/by_method.py results/adaptation/NAME results/adaptation/NAME.png
+
+The folder holds one table of `measure.py` per run. Methods with two arms are compared; the same
+numbers are printed as a Markdown table.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from measure import COLUMNS
+
+from headway.report import style
+from headway.storage.records import read_csv
+
+Row = dict[str, str]
+Scores = dict[str, dict[str, list[float]]]
+"""Of each method and arm: one score per run."""
+FROZEN = "none"
+COLORS = (style.FAINT, style.TRAINING, *style.UNSEEN)
+
+
+def scores_of(tables: list[list[Row]], *, unseen: bool) -> Scores:
+    """The mean score over training or unseen physics, each counting once."""
+    scores: Scores = {}
+    for rows in tables:
+        for arm in dict.fromkeys(row["arm"] for row in rows):
+            kept = [r for r in rows if r["arm"] == arm and (r["group"] != "train") == unseen]
+            mean = float(np.mean([float(row["score"]) for row in kept]))
+            scores.setdefault(rows[0]["method"], {}).setdefault(arm, []).append(mean)
+    return scores
+
+
+def order(scores: Scores) -> list[str]:
+    """Methods that were tested with several arms, the best mean of any arm first."""
+    several = [method for method, arms in scores.items() if len(arms) > 1]
+    return sorted(several, key=lambda name: -max(np.mean(v) for v in scores[name].values()))
+
+
+def draw(axes: Axes, scores: Scores, methods: list[str]) -> None:
+    """A line per method; a dot per run, a bar at each arm's mean."""
+    for y, method in enumerate(methods):
+        arms = list(scores[method].items())
+        means = [np.mean(values) for _, values in arms]
+        axes.plot([min(means), max(means)], [y, y], color=style.THREAD, lw=3, zorder=1)
+        for (_, values), mean, color in zip(arms, means, COLORS, strict=False):
+            axes.plot(values, [y] * len(values), "o", color=color, ms=4, alpha=0.6)
+            axes.plot(mean, y, "|", color=color, ms=16, mew=2.5)
+    axes.set_yticks(range(len(methods)), methods)
+    axes.set_ylim(len(methods) - 0.5, -0.5)
+    axes.grid(visible=True, axis="x")
+    axes.grid(visible=False, axis="y")
+
+
+def save_figure(training: Scores, unseen: Scores, path: Path, source: str) -> None:
+    """Training physics on the left, unseen ones on the right."""
+    methods = order(unseen)
+    caption = (
+        f"A dot is one run (mean over physics), a bar the mean over runs; from {source}. Score: 0"
+        " is random, 1 the planner on the true dynamics. Same trained models and test episodes for"
+        " both arms; nothing was chosen on unseen physics."
+    )
+    title = "Heads that keep learning while they act, by method"
+    size = (8.0, 1.9 + 0.42 * len(methods))
+    with style.figure(path, title=title, caption=caption, size=size) as figure:
+        left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+        for axes, scores, name in ((left, training, "training"), (right, unseen, "unseen")):
+            draw(axes, scores, methods)
+            style.label_axis(axes, f"score on {name} physics", "")
+        arms = dict.fromkeys(arm for method in methods for arm in unseen[method])
+        handles = [
+            Line2D([], [], color=color, marker="o", linestyle="", label=label(arm))
+            for arm, color in zip(arms, COLORS, strict=False)
+        ]
+        style.legend(figure, handles)
+
+
+def label(arm: str) -> str:
+    """How an arm is called for readers."""
+    return "frozen heads" if arm == FROZEN else arm
+
+
+def print_table(training: Scores, unseen: Scores) -> None:
+    """One line per method and arm."""
+    print("| method | | training, each run | mean | unseen, each run | mean |")
+    print("|---|---|---|---|---|---|")
+    for method in order(unseen):
+        for arm in unseen[method]:
+            cells = []
+            for scores in (training, unseen):
+                values = scores[method][arm]
+                cells += [" ".join(f"{v:.2f}" for v in values), f"{np.mean(values):.2f}"]
+            print(f"| `{method}` |", label(arm), "|", " | ".join(cells), "|")
+
+
+if __name__ == "__main__":
+    folder, output = map(Path, sys.argv[1:])
+    tables = [read_csv(table, COLUMNS) for table in sorted(folder.glob("*.csv"))]
+    seen, new = scores_of(tables, unseen=False), scores_of(tables, unseen=True)
+    print_table(seen, new)
+    save_figure(seen, new, output, folder.name)

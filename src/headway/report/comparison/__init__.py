@@ -1,0 +1,1 @@
+"""What an experiment or a sweep found: figure, raw numbers and table beside each other."""
