@@ -99,6 +99,10 @@ class Drift(gymnasium.Env):
     def shrink(self):
         return self.position[:2], 1.0, False, False, {}
 
+    def swell(self):
+        """An answer that no pipe holds."""
+        return np.zeros(500_000), 1.0, False, False, {}
+
     def speak(self):
         return np.array(["a", "b", "c"]), 1.0, False, False, {}
 

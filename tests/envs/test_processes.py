@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 
 import misbehaving
 from headway.envs import ProcessVectorEnv, SequentialVectorEnv
-from headway.errors import BadEnvironmentError, ConfigError
+from headway.errors import BadEnvironmentError, BrokenEpisodeError, ConfigError
 
 TIMEOUT_S = 20.0
 """For steps that answer; the machine may be busy."""
@@ -132,6 +132,29 @@ def test_a_reset_that_hangs_is_tried_again_in_the_next_episode(tmp_path):
     vector.close()
 
 
+def test_a_next_episode_that_cannot_begin_is_cut_and_tried_again():
+    class Falls(misbehaving.Drift):
+        def reset(self, **given):
+            if self.elapsed:
+                self.elapsed = 0
+                raise BrokenEpisodeError("it fell over")
+            return super().reset(**given)
+
+    vector = SequentialVectorEnv([Falls, misbehaving.Drift], episode_length=2)
+    vector.reset(seed=0)
+    for _ in range(2):
+        vector.step(ones(vector))
+    obs, reward, _, truncated, info = vector.step(ones(vector))
+    assert info["broken"] == {0: "it fell over"}
+    assert np.isnan(obs).any(1).tolist() == [True, False]
+    assert np.isnan(reward).tolist() == truncated.tolist() == [True, False]
+    obs, reward, _, truncated, info = vector.step(ones(vector))  # begins at last
+    assert "broken" not in info
+    assert np.isfinite(obs).all()
+    assert (reward.tolist(), truncated.tolist()) == ([0.0, 1.0], [False, False])
+    vector.close()
+
+
 def test_an_environment_can_give_an_episode_up_itself():
     for vector in (
         made("give_up"),
@@ -185,6 +208,23 @@ def test_only_the_parent_answers_a_request_to_stop():
     vector.close()
 
 
+def test_a_process_that_dies_in_the_middle_of_its_answer_costs_its_episode_only(monkeypatch):
+    vector = made("swell", at=1)
+    vector.reset(seed=0)
+    worker = vector._workers[0]
+    receive = worker.receive
+
+    def killed_first(*given):
+        wait_for(lambda: worker._connection.poll(0))  # it has begun to answer, and must wait
+        os.killpg(worker.pid, signal.SIGKILL)
+        return receive(*given)
+
+    monkeypatch.setattr(worker, "receive", killed_first)
+    info = vector.step(ones(vector))[-1]
+    assert info["broken"] == {0: "had its process killed by SIGKILL during step"}
+    vector.close()
+
+
 @pytest.mark.parametrize("how", ["change_spaces", "change_actions"])
 def test_spaces_must_stay_as_they_are(how):
     for vector in (made(how, at=0), SequentialVectorEnv(some(how, at=0))):
@@ -215,7 +255,8 @@ def act(how):
     signal.signal(signal.SIGINT, signal.default_int_handler)
     one = functools.partial(misbehaving.Drift, how)
     vector = ProcessVectorEnv([one, misbehaving.Drift], step_timeout_s=500.0)
-    print(os.getpid(), *vector.pids, flush=True)
+    line = " ".join(map(str, (os.getpid(), *vector.pids)))
+    os.write(1, f"{line}\\n".encode())  # whole, or the lines of four processes mix
     vector.reset(seed=0)
     for step in range(3):
         vector.step(np.ones((2, 1), np.float32))

@@ -54,6 +54,24 @@ def test_a_run_that_does_not_fit_may_be_tried_all_the_same(monkeypatch, tmp_path
         training.train_run(config, tmp_path / "run", ignore_limits=True)
 
 
+def test_a_begun_run_goes_on_where_limits_are_ignored(monkeypatch, tmp_path):
+    class LoadedError(Exception):
+        pass
+
+    def load(*_):
+        raise LoadedError
+
+    monkeypatch.setattr(limits, "free_memory", lambda: 0)
+    monkeypatch.setattr(limits, "resident", lambda: 0)
+    monkeypatch.setattr(RunDir, "finished_iterations", 1)
+    monkeypatch.setattr(RunDir, "load_data", lambda run: [])
+    monkeypatch.setattr(RunDir, "check", lambda run: None)
+    monkeypatch.setattr(loading.arrays, "load_tree", load)
+    config = make_config("pendulum", preset="smoke")
+    with pytest.raises(LoadedError):
+        training.train_run(config, tmp_path / "run", ignore_limits=True)
+
+
 def test_a_model_that_does_not_fit_is_not_built(monkeypatch, tmp_path):
     settings = {"model.hidden_sizes": (10**9,) * 4, "model.num_members": 10**8}
     settings["planner.num_particles"] = 10**8
@@ -69,7 +87,10 @@ def test_the_estimate_grows_with_what_takes_the_memory():
     assert need(**{"collection.num_episodes": 20}).data == 10 * base.data
     assert need(**{"model.num_members": 4, "planner.num_particles": 4}).model == 2 * base.model
     assert need(**{"fitting.batch_size": 320}).fitting > base.fitting
-    assert need(**{"collection.env_processes": True}).process > base.process
+    separate = need(**{"collection.env_processes": True})
+    assert separate.total - base.total == separate.workers > 0 == base.workers
+    assert separate.times(3).workers == 3 * separate.workers  # every run has its own
+    assert separate.to_test.workers > 0 == separate.to_load.workers
     assert need(preset="paper", env="half-cheetah").total < 8 * GIB
 
 
@@ -130,7 +151,7 @@ def test_an_accelerator_has_a_memory_of_its_own(monkeypatch):
 
     monkeypatch.setattr(limits.jax, "local_devices", lambda: [Device()])
     monkeypatch.setattr(limits, "free_memory", lambda: 10 * GIB)
-    limits.check_memory(need())
+    limits.check_memory(need()._replace(workers=2 * GIB))
     with pytest.raises(LimitError, match=r"1 GiB is free on Toy 9"):
         limits.check_memory(need()._replace(planning=2 * GIB))
     with pytest.raises(LimitError, match=r"on this machine"):

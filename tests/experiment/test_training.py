@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import headway
-from headway.errors import ConfigError, PlanningError, RunError
+from headway.errors import ConfigError, PlanningError, RunError, UnknownNameError
 from headway.experiment import loading, training
 from headway.experiment.methods import make_config
 from headway.experiment.progress import Progress
@@ -151,6 +151,22 @@ def test_other_settings_in_the_same_directory_are_refused_with_the_difference(re
     config = make_config("pendulum", preset="smoke", settings={**TINY, "planner.horizon": 5})
     with pytest.raises(RunError, match=r"planner\.horizon: 4 -> 5"):
         training.train_run(config, reference)
+
+
+def test_environments_are_closed_where_nothing_comes_of_a_run(reference, monkeypatch):
+    """They may be processes, which would stay for as long as somebody keeps the error."""
+    made, closed = [], []
+    make, close = training.Arena.make, training.Arena.close
+    monkeypatch.setattr(
+        training.Arena, "make", lambda config: made.append(make(config)) or made[-1]
+    )
+    monkeypatch.setattr(training.Arena, "close", lambda arena: closed.append(arena) or close(arena))
+    with pytest.raises(RunError):
+        training.train_run(make_config("pendulum", preset="smoke", seed=1), reference)
+    with pytest.raises(UnknownNameError):
+        headway.evaluate(reference, groups=["highest"])
+    training.train_run(make_config("pendulum", preset="smoke", settings=TINY), reference)
+    assert len(made) == len(closed) == 3
 
 
 def test_directory_that_is_no_run_is_refused(tmp_path):

@@ -3,7 +3,7 @@
 import functools
 import sys
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
 import equinox as eqx
@@ -121,6 +121,25 @@ def test_what_goes_wrong_in_the_program_is_told_to_each():
 
     found = side_by_side(Meeting(), *[lambda seat: misshapen(jnp.ones((2, 3)))] * 2)
     assert all(isinstance(future.exception(), TypeError) for future in found)
+
+
+def test_calls_that_cannot_be_compared_are_an_error_for_each():
+    class Odd:
+        __hash__ = None
+
+    meeting = Meeting()
+    seats = [meeting.take_seat() for _ in range(2)]
+
+    def sit(seat):
+        with seat:
+            return walk(jnp.ones(4), Odd(), key=jax.random.key(0))
+
+    pool = ThreadPoolExecutor(2)
+    found = [pool.submit(sit, seat) for seat in seats]
+    with meeting:  # frees who still waits then
+        wait(found, timeout=30)
+    pool.shutdown()
+    assert all("unhashable type: 'Odd'" in str(future.exception()) for future in found)
 
 
 def test_a_closed_meeting_stops_those_who_wait():

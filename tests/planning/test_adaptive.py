@@ -14,6 +14,7 @@ from headway.config import ModelConfig, PlannerConfig
 from headway.models.adapted import ReluNet, Window, adapt
 from headway.models.dynamics import network_input
 from headway.models.recurrent import RecurrentNet
+from headway.planning.controller import Controller, env_action
 from headway.planning.heads import RecentTransitions
 from headway.planning.meta.agent import AdaptiveAgent, imagine
 from headway.planning.meta.models import GradientAdapted, Recurrent, Transition
@@ -208,3 +209,33 @@ def test_bfloat16_products_stay_close(kind):
         for precision in ("float32", "bfloat16")
     )
     assert 0 < np.abs(exact - coarse).max() < 0.1
+
+
+def test_a_controller_holds_to_the_last_plan_where_a_sensor_fails():
+    controller = Controller(AdaptiveAgent(model_of("recurrent"), TASK, PLANNER))
+    controller.act(np.zeros(2))
+    memory, plan = jax.device_get((controller._state.memory, controller._state.search.guess[0]))
+    for step in range(PLANNER.horizon - 1):
+        found = controller.act(np.array([np.nan, 0.0]))
+        np.testing.assert_allclose(found, env_action(TASK, plan[step]), atol=1e-6)
+    assert controller.status is not None
+    assert controller.status.outcome == "held"
+    assert controller.act(np.zeros(2)).shape == (2,)
+    assert controller.status.outcome == "planned"
+    # What was done unseen is no transition to learn from.
+    jax.tree.map(np.testing.assert_array_equal, controller._state.memory, memory)
+
+
+def test_an_iteration_that_failed_is_no_failed_plan():
+    agent = AdaptiveAgent(model_of("recurrent"), TASK, PLANNER)
+    one = jnp.ones(1, jnp.int32)
+
+    class FailsOnce(AdaptiveAgent):
+        def act(self, state, obs):
+            state, decision = agent.act(state, obs)
+            return state, decision._replace(failures=one)
+
+    controller = Controller(FailsOnce(agent.model, TASK, PLANNER))
+    controller.act(np.zeros(2))
+    assert controller.status is not None
+    assert (controller.status.outcome, controller.status.iterations) == ("planned", 2)

@@ -159,13 +159,15 @@ def test_without_time_for_any_iteration_the_last_plan_goes_on_until_it_ends(monk
     assert controller.status.outcome == "held"
 
 
-def test_a_hiccup_costs_one_step():
+@pytest.mark.parametrize(("part", "iterations"), [("iterate", 1), ("end", 3)])
+def test_a_hiccup_costs_one_step(part, iterations):
     agent = make_agent()
     work = Work(agent, 8.0)
     state = agent.init(1, key=jax.random.key(0))
-    work.costs["iterate"] = 100.0
-    assert work.planner.act(state, OBS[None], work.now).iterations == 1
-    work.costs["iterate"] = 2.0
+    usual = work.costs[part]
+    work.costs[part] = 100.0
+    assert work.planner.act(state, OBS[None], work.now).iterations == iterations
+    work.costs[part] = usual
     assert work.planner.act(state, OBS[None], work.now).iterations == 0
     assert work.planner.act(state, OBS[None], work.now).iterations == 3
 

@@ -127,6 +127,25 @@ def test_seeds_of_a_configuration_are_trained_together(training, tmp_path, monke
     assert board.statuses[jobs[4].path].returns == "collected 43 ± 1"
 
 
+def test_a_seed_whose_directory_was_damaged_meanwhile_does_not_stop_the_sweep(
+    training, tmp_path, monkeypatch
+):
+    together = [fakes.tiny_job(tmp_path, seed) for seed in (0, 1)]
+    alone = fakes.tiny_job(tmp_path, **{"planner.horizon": 2})
+
+    def damaged(config, places, *, of_seed):
+        for job in together:
+            fakes.write_run(job.config, job.path, of_seed[job.config.seed])
+        (together[1].path / "config.json").write_text("{")
+        raise SeedsError("one stopped", {1: fakes.DIVERGED})
+
+    monkeypatch.setattr(running, "train_seeds", damaged)
+    board = fakes.Remembering()
+    run_jobs([*together, alone], Workers(seeds_together=True), board)
+    assert board.failures == {together[1].path: "no finite number"}
+    assert alone.finished
+
+
 def test_seeds_that_cannot_be_begun_together_go_one_by_one(training, tmp_path, monkeypatch):
     def together(*args, **options):
         raise fakes.BUSY
@@ -240,4 +259,8 @@ def test_arithmetic_of_a_run_follows_its_settings(tmp_path):
     config = fakes.tiny_job(tmp_path).config
     fitting = whole - steps * plan_flop(config.model, config.planner, load_task(config))
     assert flop(**{"fitting.epochs": 2}) == pytest.approx(whole + fitting)
+    always = flop(**{"evaluation.training_group": "always"})  # once more, after iteration 0
+    assert always - whole == pytest.approx((whole - fitting) / steps * 2 * 6)
+    seldom = {"evaluation.training_group": "always", "evaluation.every": 2}
+    assert flop(**seldom) == flop(**{"evaluation.every": 2})
     assert flop(**{"planner.horizon": 6}) == pytest.approx(2 * whole - fitting)

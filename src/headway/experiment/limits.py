@@ -27,7 +27,7 @@ class MemoryNeed(NamedTuple):
     """Bytes that a run needs at its peak, within a factor of 2."""
 
     process: int
-    """Before any array; with the processes of the environments."""
+    """Before any array."""
     model: int
     """Weights and Adam's moments, with the copies that an update and a checkpoint make."""
     data: int
@@ -36,11 +36,14 @@ class MemoryNeed(NamedTuple):
     """Shuffled samples of an epoch and the activations of a batch."""
     planning: int
     """Imagined rollouts of all candidates."""
+    workers: int
+    """The processes of the environments."""
 
     @property
     def total(self) -> int:
         """Fitting and planning are never at the same time."""
-        return self.process + self.model + self.data + max(self.fitting, self.planning)
+        own = self.process + self.model + self.data + max(self.fitting, self.planning)
+        return own + self.workers
 
     def times(self, num_runs: int) -> "MemoryNeed":
         """What several runs need that go side by side in one process."""
@@ -50,7 +53,7 @@ class MemoryNeed(NamedTuple):
     @property
     def to_load(self) -> "MemoryNeed":
         """What is needed when the model is only read."""
-        return self._replace(process=0, data=0, fitting=0, planning=0)
+        return self._replace(process=0, data=0, fitting=0, planning=0, workers=0)
 
     @property
     def to_test(self) -> "MemoryNeed":
@@ -80,11 +83,12 @@ def memory_need(config: Config, task: Task, episode_length: int) -> MemoryNeed:
     rows = members * samples * FLOAT
     workers = collection.num_episodes if collection.env_processes else 0
     return MemoryNeed(
-        PROCESS + workers * WORKER,
+        PROCESS,
         16 * FLOAT * num_parameters(config, task),
         episodes + table + rows,
         6 * rows + _batch(config, task) + _assignment(config, task, episode_length),
         _planning(config, task),
+        workers * WORKER,
     )
 
 
@@ -166,7 +170,8 @@ def check_memory(need: MemoryNeed) -> None:
         on_host = need._replace(model=0, fitting=0, planning=0)
         stats = device.memory_stats() or {}
         limit, used = stats.get("bytes_limit"), stats.get("bytes_in_use", 0)
-        _compare(need._replace(process=0), limit and limit - used, f"on {device.device_kind}")
+        on_device = need._replace(process=0, workers=0)
+        _compare(on_device, limit and limit - used, f"on {device.device_kind}")
     free = free_memory()
     _compare(on_host, free if free is None else free + resident(), "on this machine")
 

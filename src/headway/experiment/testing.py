@@ -68,16 +68,24 @@ def run_tests(
     config = config_to_evaluate(run.config(), changes)
     check_memory(need_of(config).to_test)
     arena = Arena.make(config)
-    agent = load_agent(run, config, arena)
-    known = arena.sim_params.group_names
-    for group in groups or ():
-        if group not in known:
-            raise unknown_name("group", group, known)
-    groups = list(dict.fromkeys(groups or known))
-    iteration = run.finished_iterations - 1
     with progress or Progress() as shown, closing(arena):
+        agent = load_agent(run, config, arena)
+        groups = _known_groups(groups, arena.sim_params.group_names)
+        iteration = run.finished_iterations - 1
         total = len(groups) * config.evaluation.num_episodes * arena.episode_length
         shown.phase(iteration, run.finished_iterations, "evaluate", total)
         key = jax.random.key(config.evaluation.seed)
         found, use = evaluate_agent(agent, arena, config, groups, key=key, progress=shown)
     return Tested(config, iteration, agent, arena, found, use)
+
+
+def _known_groups(wanted: Sequence[str] | None, known: Sequence[str]) -> list[str]:
+    """The wanted groups, each once; all by default.
+
+    Raises:
+        UnknownNameError: No such group.
+    """
+    for group in wanted or ():
+        if group not in known:
+            raise unknown_name("group", group, known)
+    return list(dict.fromkeys(wanted or known))

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -82,16 +82,22 @@ class Trainer:
             RunError: The directory holds another run, or a damaged one.
             BadEnvironmentError: The environment does not fit its Task.
         """
-        arena = Arena.make(config)
-        learner = make_learner(config, arena.task, arena.episode_length)
-        run.create_or_resume(config)
-        run.check()
-        run.tidy()
-        buffer = ReplayBuffer(arena.task.obs_size, arena.task.action_size)
-        for trajectory in run.load_data() if learner.learns else ():
-            buffer.add(trajectory)
-        finished = run.finished_iterations
-        learned = initial(config, arena.task) if finished == 0 else load_learned(run, config)
+        with ExitStack() as unless_open:
+            arena = Arena.make(config)
+            unless_open.callback(arena.close)
+            learner = make_learner(config, arena.task, arena.episode_length)
+            run.create_or_resume(config)
+            run.check()
+            run.tidy()
+            buffer = ReplayBuffer(arena.task.obs_size, arena.task.action_size)
+            for trajectory in run.load_data() if learner.learns else ():
+                buffer.add(trajectory)
+            finished = run.finished_iterations
+            if finished == 0:
+                learned = initial(config, arena.task)
+            else:  # the limits were looked at before, or are to be ignored
+                learned = load_learned(run, config, ignore_limits=True)
+            unless_open.pop_all()
         return cls(config, run, arena, learner, learned, buffer, progress, stop)
 
     def train(self) -> None:

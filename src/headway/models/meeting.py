@@ -175,6 +175,10 @@ class Meeting:
         try:
             for alike in _by_kind(calls):
                 self._compute_alike(alike)
+        except BaseException as error:  # some could not be compared; nobody may wait for them
+            for call in calls:
+                if not call.over:
+                    call.end(None, error)
         finally:
             self._changed.acquire()
             self._changed.notify_all()

@@ -1,7 +1,7 @@
 """An agent: recent history, head selection, and a planner around a dynamics model."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -263,11 +263,15 @@ def reset_where(state: AgentState, fresh: AgentState, done: Bool[Array, " env"])
     return kept._replace(key=state.key)
 
 
-def hold(agent: Agent, state: AgentState) -> AgentState:
+def hold(planner: PlannerConfig, state: Any) -> Any:
     """Go on along the last plan without a look: its next action is the state's `action`.
 
     The transition that the action causes is not remembered, because it begins unseen.
+
+    Args:
+        planner: What made the plan.
+        state: An `AgentState`, or that of another agent that plans.
     """
-    search = make_optimizer(agent.planner).shift(state.search)
+    search = make_optimizer(planner).shift(state.search)
     unseen = jnp.zeros_like(state.acted)
     return state._replace(action=state.search.guess[:, 0], acted=unseen, search=search)

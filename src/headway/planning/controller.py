@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
+from headway.config import PlannerConfig
 from headway.errors import ConfigError, PlanningError, shown
 from headway.planning.acting import Acting
 from headway.planning.agent import Agent, hold
@@ -158,8 +159,13 @@ class Controller:
         return self._heads
 
     @property
+    def _planner(self) -> PlannerConfig | None:
+        """Settings of the planner, of an agent that plans."""
+        return getattr(self.agent, "planner", None)
+
+    @property
     def _num_iterations(self) -> int:
-        return self.agent.planner.num_iterations if isinstance(self.agent, Agent) else 1
+        return self._planner.num_iterations if self._planner else 1
 
     def _planner_to(self, deadline_ms: float) -> DeadlinePlanner:
         if not 0 < deadline_ms < float("inf"):
@@ -202,7 +208,7 @@ class Controller:
     def _hold(self, reason: str, started: float) -> Float[np.ndarray, " action"]:
         """The next action of the last plan."""
         self._count(True, reason)
-        self._state = _held(self.agent, self._state)
+        self._state = _held(self._planner, self._state)
         scaled = jax.device_get(self._state.action[0])
         self._status = Status("held", reason, (), 0, time.perf_counter() - started)
         return env_action(self.agent.task, scaled)
@@ -214,7 +220,7 @@ class Controller:
             PlanningError: Nothing is.
         """
         if not held:
-            self._left = self.agent.planner.horizon - 1 if isinstance(self.agent, Agent) else 0
+            self._left = self._planner.horizon - 1 if self._planner else 0
         elif self._left <= 0:
             raise PlanningError(
                 f"{reason}, and no earlier plan is left, allowed: to hold to a plan for at most"

@@ -2,8 +2,8 @@
 
 Between two iterations the clock is read, and another one begins only if the slowest of the
 last ones would still fit. So the answer is late only where a part takes longer than it lately
-did, by that much. A step in which nothing fits forgets the slowest, so that one hiccup is not
-remembered for long. The price is a return to Python after every iteration.
+did, by that much. A step in which nothing fits forgets the slowest of each part, so that one
+hiccup is not remembered for long. The price is a return to Python after every iteration.
 """
 
 import time
@@ -111,10 +111,10 @@ class DeadlinePlanner:
         return self._clock() + sum(max(d) for d in self._durations.values()) <= until
 
     def _forget_slowest(self) -> None:
-        durations = self._durations["iterate"]
-        durations.remove(max(durations))
-        if not durations:
-            durations.append(0.0)
+        for durations in self._durations.values():
+            durations.remove(max(durations))
+            if not durations:
+                durations.append(0.0)
 
     def _timed(self, name: str, *parts: Any) -> Any:
         started = self._clock()

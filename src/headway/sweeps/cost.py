@@ -80,9 +80,10 @@ def run_flop(config: Config, first_iteration: int = 0) -> float:
     for iteration in range(first_iteration, config.collection.num_iterations):
         collected = config.collection.num_episodes * length
         steps = collected if iteration else 0  # the first collection acts at random
-        groups = num_unseen if (iteration + 1) % config.evaluation.every == 0 else 0
-        if iteration == config.collection.num_iterations - 1:
-            groups = num_unseen + 1
+        last = iteration == config.collection.num_iterations - 1
+        tested = last or (iteration + 1) % config.evaluation.every == 0
+        with_train = last or config.evaluation.training_group == "always"
+        groups = num_unseen + with_train if tested else 0
         steps += groups * config.evaluation.num_episodes * length
         passes = config.fitting.epochs * (iteration + 1) * collected
         total += steps * per_step + passes * config.fitting.future_length * per_sample

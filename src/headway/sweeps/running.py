@@ -13,7 +13,7 @@ from pathlib import Path
 from headway.errors import BusyError, ConfigError, HeadwayError, SeedsError
 from headway.experiment.seeds import train_seeds
 from headway.experiment.training import train_run
-from headway.sweeps.board import Board
+from headway.sweeps.board import Board, first_status
 from headway.sweeps.jobs import Job
 from headway.sweeps.status import Status, StatusProgress, Tell
 
@@ -112,7 +112,7 @@ def make_together(jobs: Sequence[Job], board: Board) -> None:
     if len(jobs) > 1:
         told = {
             job.config.seed: StatusProgress(
-                functools.partial(board.tell, job), job.finished_iterations
+                functools.partial(board.tell, job), first_status(job).iteration
             )
             for job in jobs
         }
@@ -128,7 +128,7 @@ def make_together(jobs: Sequence[Job], board: Board) -> None:
         if reason is None:
             ended = make_run(job, functools.partial(board.tell, job))
         else:
-            ended = Status("failed", job.finished_iterations, note=str(reason))
+            ended = Status("failed", first_status(job).iteration, note=str(reason))
         returns = ended.returns or board.statuses[job.path].returns
         board.tell(job, dataclasses.replace(ended, returns=returns))
 

@@ -96,7 +96,7 @@ class Worker:
                 raise LostWorkerError(f"did not answer to {method} within {timeout_s:g} s")
             try:
                 call, kind, *found = self._connection.recv()
-            except (EOFError, ConnectionResetError):
+            except (EOFError, OSError):  # before its answer, or in the middle of it
                 raise LostWorkerError(f"{self._fate()} during {method}") from None
             if call == self._calls:  # else nobody waited for this answer
                 break
