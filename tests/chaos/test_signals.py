@@ -1,11 +1,13 @@
 """Ctrl-C and SIGTERM save what is done, and say so with the exit code."""
 
+import itertools
 import os
 import signal
 import subprocess
 import sys
 import time
 
+import jax
 import killing
 import numpy as np
 import pytest
@@ -15,8 +17,11 @@ from headway.errors import BadEnvironmentError
 from headway.experiment import resumable, training
 from headway.experiment.learners import multi_headed
 from headway.experiment.progress import Progress
+from headway.experiment.rollouts import Choice
+from headway.planning.acting import RandomAgent
 from headway.storage import progress_store
-from headway.storage.interrupts import Terminated
+from headway.storage.interrupts import StopRequest, Terminated
+from headway.storage.progress_store import ProgressStore
 
 
 class Signalling(Progress):
@@ -202,6 +207,25 @@ def test_damaged_parts_are_reported_and_done_again(reference, tmp_path):
     assert killing.result(path) == killing.result(reference)
 
 
+def test_parts_that_another_version_kept_are_done_again(reference, tmp_path, monkeypatch):
+    path = tmp_path / "run"
+    with pytest.raises(Terminated):  # in the middle of the second test
+        training.train_run(killing.tiny_config(), path, Signalling(signal.SIGTERM, 34))
+    load, read = progress_store.ProgressStore.load, []
+
+    def other_names(self, name):
+        part = load(self, name)
+        if part is not None:
+            read.append(name)
+            return part._replace(arrays={f"old.{n}": part.arrays[n] for n in part.arrays})
+        return None
+
+    monkeypatch.setattr(progress_store.ProgressStore, "load", other_names)
+    training.train_run(killing.tiny_config(), path)
+    assert read == ["collect", "fit", "evaluate-0-actions"]
+    assert killing.result(path) == killing.result(reference)
+
+
 def test_an_environment_that_does_not_repeat_itself_begins_the_episodes_anew(tmp_path, monkeypatch):
     path = tmp_path / "run"
     with pytest.raises(Terminated):  # in the middle of the second collection
@@ -215,17 +239,63 @@ def test_an_environment_that_does_not_repeat_itself_begins_the_episodes_anew(tmp
         return arena
 
     monkeypatch.setattr(training.Arena, "make", other_physics)
-    repeated = []
-    noted = resumable.run_episodes
+    given_up = []
+    whole = resumable.run_episodes
 
     def run_episodes(*asked):
-        repeated.append(1)
-        return noted(*asked)
+        try:
+            return whole(*asked)
+        except Exception as error:
+            given_up.append(type(error))
+            raise
 
     monkeypatch.setattr(resumable, "run_episodes", run_episodes)
     run = training.train_run(killing.tiny_config(), path)
     assert len(run.metrics()) == 3
-    assert repeated
+    assert given_up == [resumable._NotRepeatableError]
+
+
+def test_episodes_that_end_before_the_kept_actions_do_begin_anew(tmp_path):
+    """Actions that were planned for other observations are not taken for these."""
+    arena = training.Arena.make(killing.tiny_config())
+    num_envs = arena.vector.num_envs
+    none = np.zeros(num_envs, int)
+    plans = []
+
+    class Still(training.AgentPolicy):
+        def __init__(self):
+            self.state = RandomAgent(arena.task).init(num_envs, key=jax.random.key(0))
+
+        def __call__(self, obs):
+            plans.append(1)
+            return Choice(np.zeros((num_envs, 1), np.float32), none, none)
+
+    def attempt(stop):
+        store = ProgressStore(tmp_path / "partial", 1, "origin", stop)
+        store.open()
+        episodes = [
+            training.Episode({"mass": 1.0, "length": 1.0}, seed) for seed in range(num_envs)
+        ]
+
+        def on_step(_):
+            stop.signal = signal.SIGTERM if len(plans) == 4 else None
+
+        return resumable.resumable_episodes(store, "collect", arena, episodes, Still, on_step)
+
+    with pytest.raises(Terminated):
+        attempt(StopRequest())
+    plans.clear()
+    step = arena.vector.step
+    ends = itertools.cycle([np.zeros(num_envs, bool), np.ones(num_envs, bool)])
+
+    def other_step(actions):
+        obs, reward, _, cut, info = step(actions)
+        return obs, reward, next(ends), cut, info
+
+    arena.vector.step = other_step
+    found = attempt(StopRequest())
+    assert [len(trajectory) for trajectory in found.trajectories] == [2] * num_envs
+    assert len(plans) == 2
 
 
 def test_an_error_is_not_hidden_by_a_request_to_stop(tmp_path):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
+import misbehaving
 from headway import envs
 from headway.envs import SequentialVectorEnv
 from headway.errors import ConfigError
@@ -92,3 +93,20 @@ def test_environments_that_cannot_change_say_so():
     env.reset(options={"schedule": {0: {"length": 1.0}}})
     with pytest.raises(ConfigError, match="set_sim_params"):
         env.step(np.zeros((1, 1), np.float32))
+
+
+def test_what_an_environment_does_not_tell_may_change_too():
+    class Silent(misbehaving.Drift):
+        def reset(self, **given):
+            return super().reset(**given)[0], {}
+
+        def set_sim_params(self, values):
+            self.wind = values["wind"]
+
+    one, other = Silent(), Silent()
+    env = SequentialVectorEnv([lambda: one, lambda: other], autoreset_mode="Disabled")
+    env.reset(options={"schedule": [{1: {"wind": 2.0}}, {}]})
+    steps = [env.step(np.zeros((2, 1), np.float32))[-1]["sim_params"] for _ in range(2)]
+    assert steps[0] == {}
+    np.testing.assert_array_equal(steps[1]["wind"], [2.0, np.nan])
+    assert one.wind == 2.0

@@ -178,10 +178,12 @@ def test_bad_arguments_are_refused():
         envs.make_vec("pendulum", 1, autoreset_mode=AutoresetMode.SAME_STEP)
     with pytest.raises(UnknownNameError, match="Did you mean 'scale_inertia'"):
         envs.make_vec("hopper", 1, options={"scale_inertias": True})
-    vector = envs.make_vec("pendulum", 2)
-    vector.reset(seed=0)
-    with pytest.raises(ConfigError, match="action"):
-        vector.step(np.zeros((3, 1)))
+    separate = [lambda: gymnasium.make("Pendulum-v1")] * 2
+    for vector in (SequentialVectorEnv(separate), envs.make_vec("pendulum", 2)):
+        vector.reset(seed=0)
+        for shape in ((3, 1), (1, 1), (2,), ()):
+            with pytest.raises(ConfigError, match="action"):
+                vector.step(np.zeros(shape))
     with pytest.raises(ConfigError, match="seed"):
         vector.reset(seed=[1, 2, 3])
     with pytest.raises(ConfigError, match="env_fns"):

@@ -147,6 +147,18 @@ def test_variants_of_a_method_are_told_apart(tmp_path, write_run):
     assert "planner.horizon" in page
 
 
+def test_what_is_tolerated_of_an_environment_makes_no_variant(tmp_path, write_run):
+    separate = {"collection.env_processes": True}
+    for seed, changed in enumerate([{}, separate, {}]):
+        write_run(tmp_path / f"seed{seed}", seed=seed, settings_changed=changed)
+    write_run(tmp_path / "seed2-again", seed=2, settings_changed=separate)
+    runs, notes = load_runs([tmp_path])
+    assert series_labels(runs) == ["tmcl"] * 3
+    assert [note.text for note in notes] == [
+        f"left out: same settings and seed as {tmp_path / 'seed2'}."
+    ]
+
+
 def test_settings_that_a_run_cannot_use_make_no_variants(tmp_path, write_run):
     for seed, transitions in ((0, 0), (1, 20)):
         changed = {"fitting.relation_transitions": transitions, "planner.temperature": 1.0 + seed}

@@ -70,6 +70,7 @@ def test_files_stand_beside_each_other_and_hold_what_the_runs_say(training, tmp_
     assert "| T-MCL | 3 | 42.0 ± 1.0 | 42.0 (4" in table
     # All of T-MCL's runs are above all of MCL's.
     assert "- T-MCL is better than MCL (probability of improvement 1.00, 1.00 to 1.00" in table
+    assert "- Intervals from fewer than 10 seeds are too narrow" in table
     assert "    headway reproduce fig13\n" in table
     assert "no difference between arms can be claimed" not in table
 

@@ -60,6 +60,15 @@ class SeparateVectorEnv(HeadwayVectorEnv):
             What it returned, or a `BrokenEpisodeError`.
         """
 
+    def _check_actions(self, actions: np.ndarray) -> np.ndarray:
+        allowed = self.action_space.shape
+        if allowed is not None and np.shape(actions) != allowed:
+            raise ConfigError(
+                f"actions have shape {np.shape(actions)}, allowed: {allowed}, an action for each"
+                " environment."
+            )
+        return actions
+
     def _begin(
         self, chosen: np.ndarray, seeds: Sequence[int | None], requested: Sequence[SimParams]
     ) -> dict[int, SimParams | BrokenEpisodeError]:

@@ -116,7 +116,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if restart.any():
             nothing = [{}] * self.num_envs
             self._start(np.flatnonzero(restart), [None] * self.num_envs, nothing)
-        broken = {int(i): self._broken[i] for i in np.flatnonzero(restart) if i in self._broken}
+        broken = {i: why for i, why in self._broken.items() if restart[i]}
         active = np.flatnonzero(~self._finished & ~restart)
         broken |= self._follow_schedules(active)
         active = np.setdiff1d(active, list(broken))
@@ -162,9 +162,12 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             values = requested[i] if isinstance(begun, BrokenEpisodeError) else begun
             if isinstance(begun, BrokenEpisodeError):
                 self._broken[i], self._ends[1, i] = str(begun), True
-            for name, value in values.items():
-                self._sim_params.setdefault(name, np.full(self.num_envs, np.nan))[i] = value
+            self._note_sim_params(i, values)
             self._schedules[i] = {}
+
+    def _note_sim_params(self, i: int, values: SimParams) -> None:
+        for name, value in values.items():
+            self._sim_params.setdefault(name, np.full(self.num_envs, np.nan))[i] = value
 
     def _follow_schedules(self, active: np.ndarray) -> dict[int, str]:
         """Change the physics of the environments where it is time to; return what broke."""
@@ -176,8 +179,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                     self._change(int(i), changed)
             except BrokenEpisodeError as error:
                 broken[int(i)] = str(error)
-            for name, value in changed.items():
-                self._sim_params[name][i] = value
+            self._note_sim_params(int(i), changed)
         return broken
 
     def _read_seeds(self, seed: Seeds) -> list[int | None]:

@@ -35,7 +35,7 @@ _KEPT = ("action", "failures", "evaluations")  # of every choice
 
 
 class _NotRepeatableError(Exception):
-    """The same actions led elsewhere than the first time."""
+    """The same actions led elsewhere than the first time, or cannot be read."""
 
 
 class Recorder:
@@ -59,7 +59,10 @@ class Recorder:
         self._wanted = ""
         part = store.load(name)
         if part is not None:
-            self._restore(part, store.path(name))
+            try:
+                self._restore(part, store.path(name))
+            except RunError as error:  # kept by another version
+                raise _NotRepeatableError from error
 
     def __call__(self, obs: Float[np.ndarray, "env obs"]) -> Choice:
         """Choose an action, or repeat it."""
@@ -74,6 +77,15 @@ class Recorder:
         elif self._step == self._known and self._seen.hexdigest() != self._wanted:
             raise _NotRepeatableError
         return self._choices[self._step - 1]
+
+    def check_repeated(self) -> None:
+        """Make sure that the episodes did not end before the actions of the earlier attempt.
+
+        Raises:
+            _NotRepeatableError: They did.
+        """
+        if self._step < self._known:
+            raise _NotRepeatableError
 
     def _part(self) -> Part:
         made = {
@@ -130,29 +142,48 @@ def resumable_episodes(
         make_policy: Makes the policy that chooses the actions; it is the same every time.
         on_step: Called after each step with the number of environments that stepped.
     """
-    part = store.load(name)
-    if part is not None:
+    finished = _finished_before(store, name, len(episodes))
+    if finished is not None:
         on_step(len(episodes) * arena.episode_length)
-        return _restore(part, len(episodes), store.path(name))
+        return finished
     tape = f"{name}-actions"
-
-    def policy() -> Policy:
-        made = make_policy()
-        # Random actions are as quick to draw again.
-        return Recorder(made, store, tape) if isinstance(made, AgentPolicy) else made
 
     def after_step(steps: int) -> None:
         on_step(steps)
         store.stop_if_asked()
 
+    def run() -> Rollout:
+        policy = make_policy()
+        if not isinstance(policy, AgentPolicy):  # random actions are as quick to draw again
+            return run_episodes(arena, episodes, policy, after_step)
+        recorder = Recorder(policy, store, tape)
+        rollout = run_episodes(arena, episodes, recorder, after_step)
+        recorder.check_repeated()
+        return rollout
+
     try:
-        rollout = run_episodes(arena, episodes, policy(), after_step)
+        rollout = run()
     except _NotRepeatableError:
         store.drop(tape)
-        rollout = run_episodes(arena, episodes, policy(), after_step)
+        rollout = run()
     store.drop(tape)
     store.offer(name, lambda: _finished(rollout))
     return rollout
+
+
+def _finished_before(store: ProgressStore, name: str, num_episodes: int) -> Rollout | None:
+    """The episodes that an interrupted attempt finished; None where this version cannot read them.
+
+    That their file is as it was written is known since `take_up`.
+    """
+    part = store.load(name)
+    if part is None:
+        return None
+    try:
+        return _restore(part, num_episodes, store.path(name))
+    except RunError:
+        store.drop(name)
+        return None
 
 
 def _finished(rollout: Rollout) -> Part:
@@ -199,11 +230,21 @@ def fit_part(state: FitState, history: list[EpochStats], rollbacks: int) -> Part
 
 
 def fitted_before(store: ProgressStore, fresh: FitState) -> tuple[FitState, list[EpochStats], int]:
-    """The fit that an interrupted attempt kept, or the one to begin with; and its roll-backs."""
+    """The fit that an interrupted attempt kept, or the one to begin with; and its roll-backs.
+
+    One that another version kept is made anew.
+    """
     part = store.load("fit")
     if part is None:
         return fresh, [], 0
-    path = store.path("fit")
+    try:
+        return _fit_from(part, fresh, store.path("fit"))
+    except RunError:
+        store.drop("fit")
+        return fresh, [], 0
+
+
+def _fit_from(part: Part, fresh: FitState, path: Path) -> tuple[FitState, list[EpochStats], int]:
     try:
         columns: list[Any] = [part.arrays[f"stats.{name}"] for name in EpochStats._fields]
         history = [EpochStats(*row) for row in zip(*columns, strict=True)]

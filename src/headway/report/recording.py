@@ -59,7 +59,7 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
         run_dir: The run directory.
         output: The file to write; its ending, .gif or .webp, chooses the format.
         sim_params: The physics, drawn from the training physics by default. Parameters that are
-            not named are as in the unchanged environment.
+            not named are drawn from them all the same.
         schedule: Physics that change during the episode, by step.
         seed: Seeds the start and the planner's draws.
         num_steps: Steps to film; a full episode by default.

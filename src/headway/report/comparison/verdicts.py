@@ -20,11 +20,11 @@ def verdicts(found: Found) -> list[str]:
     """Compare the reference of the experiment with every other arm, over all environments.
 
     Only runs that both arms have in an environment are compared; a task is an environment with
-    one group of physics.
+    one group of physics. The last line warns where intervals come from too few seeds.
     """
     arms = found.comparison.experiment.arms
     reference = found.comparison.experiment.reference_arm
-    lines = []
+    lines, counts = [], []
     for arm in arms:
         pairs = [
             (ours[group], theirs[group])
@@ -39,4 +39,6 @@ def verdicts(found: Found) -> list[str]:
             continue
         improvement = statistics.probability_of_improvement(*zip(*pairs, strict=True))
         lines.append(statistics.verdict(reference.label, arm.label, improvement))
-    return lines
+        counts += [improvement.num_runs] if improvement.interval else []
+    warning = statistics.caution(min(counts)) if counts else ""
+    return [*lines, warning] if warning else lines

@@ -23,8 +23,8 @@ _TEXTS = ("env", "method", "group", "sim_params")
 def settings(comparison: Comparison) -> Section:
     """The settings in which the runs of an environment differ."""
     lead = (
-        "Settings that are not the same in all runs of an environment, seeds aside. Everything else"
-        " that the runs use is equal."
+        "Settings that are not the same in all runs of an environment, seeds and what is tolerated"
+        " of environments that break aside. Everything else that the runs use is equal."
     )
     blocks = [_settings_of(comparison, env) for env in comparison.envs]
     return Section("settings", "Settings that differ", lead, blocks)

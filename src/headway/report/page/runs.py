@@ -137,15 +137,19 @@ def _newest(rows: list[Row]) -> list[Row]:
 
 
 def _without_copies(runs: Sequence[LoadedRun], notes: list[Note]) -> list[LoadedRun]:
-    """Leave out runs of the same settings and seed: they would count one seed twice."""
-    kept: list[LoadedRun] = []
+    """Leave out runs of the same settings and seed: they would count one seed twice.
+
+    What is tolerated of an environment (`settings.TOLERANCE`) makes no other run.
+    """
+    kept: list[tuple[Config, LoadedRun]] = []
     for run in runs:
-        same = next((o for o in kept if not settings.differences(o.config, run.config)), None)
+        config = settings.tolerating_as(run.config, runs[0].config)
+        same = next((o for known, o in kept if not settings.differences(known, config)), None)
         if same is None:
-            kept.append(run)
+            kept.append((config, run))
         else:
             notes.append(Note(run.path, f"left out: same settings and seed as {same.path}."))
-    return kept
+    return [run for _, run in kept]
 
 
 def train_command(run: LoadedRun) -> list[str]:

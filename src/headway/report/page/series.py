@@ -10,7 +10,7 @@ from headway.experiment.methods import METHODS
 from headway.report.page.runs import LoadedRun, Note
 from headway.report.page.scoring import REFERENCES, Outcome, References, outcome
 
-_NAMES = ("env", "method", "seed")  # runs differ in these without being variants
+_NAMES = ("env", "method", "seed", *settings.TOLERANCE)  # differ without making a variant
 _SWATCHES = 8
 
 
