@@ -14,6 +14,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 import headway
+from headway import errors
 
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -56,6 +57,13 @@ def test_public_name_resolves_and_is_documented(name):
         # A dataclass without a docstring gets its signature as one.
         assert doc
         assert not doc.startswith(f"{name}(")
+
+
+def test_every_error_is_public():
+    raised = [name for name, value in vars(errors).items() if inspect.isclass(value)]
+    wanted = {name for name in raised if issubclass(getattr(errors, name), headway.HeadwayError)}
+    assert "PlanningError" in wanted
+    assert wanted <= set(headway.__all__)
 
 
 def test_unknown_public_name_is_an_attribute_error():

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from headway.api import Evaluation as Evaluation
     from headway.api import Run as Run
     from headway.api import evaluate as evaluate
-    from headway.api import load as load
     from headway.api import train as train
     from headway.api import train_seeds as train_seeds
     from headway.config import Config as Config
@@ -22,10 +21,12 @@ if TYPE_CHECKING:
     from headway.data import Trajectory as Trajectory
     from headway.errors import BadEnvironmentError as BadEnvironmentError
     from headway.errors import BrokenEpisodeError as BrokenEpisodeError
+    from headway.errors import BusyError as BusyError
     from headway.errors import ConfigError as ConfigError
     from headway.errors import DivergenceError as DivergenceError
     from headway.errors import HeadwayError as HeadwayError
     from headway.errors import LimitError as LimitError
+    from headway.errors import PlanningError as PlanningError
     from headway.errors import RunError as RunError
     from headway.errors import SeedsError as SeedsError
     from headway.errors import UnknownNameError as UnknownNameError
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from headway.report.page.build import write_report as write_report
     from headway.report.recording import Recording as Recording
     from headway.report.recording import record as record
+    from headway.service import load as load
     from headway.sim_params import SimParamSets as SimParamSets
     from headway.storage.run_dir import RunDir as RunDir
     from headway.storage.tables import EpisodeRow as EpisodeRow
@@ -56,7 +58,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
-    "api": ("Evaluation", "Run", "evaluate", "load", "train", "train_seeds"),
+    "api": ("Evaluation", "Run", "evaluate", "train", "train_seeds"),
     "config": ("Config",),
     "data": ("ReplayBuffer", "Trajectory"),
     "errors": (
@@ -64,8 +66,10 @@ _HOME = {
         "DivergenceError",
         "BadEnvironmentError",
         "BrokenEpisodeError",
+        "BusyError",
         "HeadwayError",
         "LimitError",
+        "PlanningError",
         "RunError",
         "SeedsError",
         "UnknownNameError",
@@ -79,6 +83,7 @@ _HOME = {
     "report.dynamics": ("plot_dynamics",),
     "report.page.build": ("write_report",),
     "report.recording": ("Recording", "record"),
+    "service": ("load",),
     "sim_params": ("SimParamSets",),
     "storage.run_dir": ("RunDir",),
     "storage.tables": ("EpisodeRow",),

@@ -1,4 +1,4 @@
-"""What most users need: train, evaluate, load."""
+"""What most users need: train, evaluate; `headway.service` loads."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
@@ -8,7 +8,6 @@ from typing import Any, overload
 from headway.config import Config
 from headway.errors import ConfigError, shown
 from headway.experiment.evaluation import PlanningCost, episode_rows
-from headway.experiment.loading import load_agent
 from headway.experiment.methods import make_config
 from headway.experiment.progress import Progress
 from headway.experiment.seeds import train_seeds as train_together
@@ -16,6 +15,7 @@ from headway.experiment.testing import run_tests
 from headway.experiment.training import train_run
 from headway.planning.controller import Controller
 from headway.report.figures import save_run_figures
+from headway.service import load
 from headway.storage.run_dir import RunDir
 from headway.storage.tables import EpisodeRow
 
@@ -36,7 +36,7 @@ class Run:
     """The figures made after training."""
 
     def controller(self, *, seed: int = 0, **options: Any) -> Controller:
-        """The trained controller; options are those of `Controller`."""
+        """The trained controller; options are those of `load`."""
         return load(self.path, seed=seed, **options)
 
 
@@ -206,20 +206,6 @@ def evaluate(
     rows = episode_rows(tested.config, tested.iteration, tested.trajectories)
     cost = PlanningCost.of(tested.use, tested.config, tested.arena.task)
     return Evaluation(rows, tested.config, cost)
-
-
-def load(run_dir: str | Path, *, seed: int = 0, **options: Any) -> Controller:
-    """Load the controller of a run.
-
-    Args:
-        run_dir: The run directory.
-        seed: Seeds the planner's draws.
-        options: Those of `Controller`, for example `deadline_ms=50`.
-
-    Raises:
-        RunError: There is no trained run, or it is damaged.
-    """
-    return Controller(load_agent(RunDir(run_dir)), seed=seed, **options)
 
 
 def default_run_dir(config: Config) -> Path:

@@ -11,9 +11,12 @@ import pytest
 
 import toys
 from headway.config import ModelConfig, PlannerConfig
+from headway.errors import ConfigError
+from headway.experiment.methods import METHODS
 from headway.models.adapted import ReluNet, Window, adapt
 from headway.models.dynamics import network_input
 from headway.models.recurrent import RecurrentNet
+from headway.planning.acting import RandomAgent
 from headway.planning.controller import Controller, env_action
 from headway.planning.heads import RecentTransitions
 from headway.planning.meta.agent import AdaptiveAgent, imagine
@@ -224,6 +227,15 @@ def test_a_controller_holds_to_the_last_plan_where_a_sensor_fails():
     assert controller.status.outcome == "planned"
     # What was done unseen is no transition to learn from.
     jax.tree.map(np.testing.assert_array_equal, controller._state.memory, memory)
+
+
+@pytest.mark.parametrize("method", ["grbal", "rebal", "random"])
+def test_a_method_that_has_no_deadline_is_named(method):
+    kind = {"grbal": "gradient", "rebal": "recurrent"}.get(method)
+    agent = AdaptiveAgent(model_of(kind), TASK, PLANNER) if kind else RandomAgent(TASK)
+    with pytest.raises(ConfigError, match=f"is 50, but {method} cannot .*allowed: None"):
+        Controller(agent, deadline_ms=50.0)
+    assert method in METHODS
 
 
 def test_an_iteration_that_failed_is_no_failed_plan():

@@ -27,6 +27,7 @@ TINY = PlannerConfig(
 )
 UP_DOWN = toys.linear_model([[np.eye(2), -np.eye(2)], [-np.eye(2), np.eye(2)]])
 OBS = np.float32([0.8, -0.6])
+BLIND = np.float32([np.nan, 0.0])
 LONG = 1e7  # milliseconds
 
 
@@ -157,6 +158,42 @@ def test_without_time_for_any_iteration_the_last_plan_goes_on_until_it_ends(monk
     assert controller.status.iterations == 1
     controller.act(obs)
     assert controller.status.outcome == "held"
+
+
+SERVICE = [  # what is seen, how often another iteration fits, what comes of it, what was applied
+    (OBS, 4, "planned"),
+    (OBS, 4, "planned"),
+    (OBS, 4, "planned", [0.1, 0.2]),
+    (OBS, 4, "planned", BLIND),
+    (BLIND, 0, "held"),
+    ([1e6, 0.0], 4, "planned"),  # unlike anything that was trained on
+    *[(OBS, times, "deadline") for times in (1, 2, 3)],
+    (OBS, 0, "held"),
+    (BLIND, 0, "held"),
+    (OBS, 0, "held"),
+    (OBS, 0, "deadline"),  # nothing is left of the plan
+    (BLIND, 0, "held"),
+]
+
+
+@pytest.mark.parametrize("settings", [{}, {"optimizer": "icem"}], ids=str)
+def test_with_a_deadline_nothing_is_compiled_in_service(settings, monkeypatch, caplog):
+    jax.clear_caches()
+    controller = Controller(make_agent(**settings), deadline_ms=LONG)
+    assert controller._deadline is not None
+    with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
+        for obs, times, outcome, *rest in SERVICE:
+            applied = rest[0] if rest else None
+            clock = iter([True] * times)
+            monkeypatch.setattr(controller._deadline, "_fits", lambda _, c=clock: next(c, False))
+            controller.act(obs, applied_action=applied)
+            assert controller.status is not None
+            assert controller.status.outcome == outcome
+        controller.reset()
+        with pytest.raises(PlanningError):
+            controller.act(BLIND)
+        controller.act(OBS)
+    assert [record.getMessage()[:99] for record in caplog.records] == []
 
 
 @pytest.mark.parametrize(("part", "iterations"), [("iterate", 1), ("end", 3)])

@@ -1,18 +1,22 @@
 """Missing runs are made once each, whatever happens to some of them."""
 
 import io
+import shutil
+from pathlib import Path
 
 import fakes
 import pytest
 from rich.console import Console
 
-from headway.errors import ConfigError, SeedsError
+from headway.errors import ConfigError, RunError, SeedsError
 from headway.experiment.loading import load_task
 from headway.planning.flop import plan_flop
+from headway.storage.run_dir import RunDir
 from headway.storage.run_lock import locked
 from headway.sweeps import running
 from headway.sweeps.board import PlainBoard
 from headway.sweeps.cost import make_plan, run_flop
+from headway.sweeps.jobs import Job
 from headway.sweeps.live_board import LiveBoard
 from headway.sweeps.running import Workers, run_jobs
 from headway.sweeps.status import Status, StatusProgress
@@ -62,6 +66,16 @@ def test_a_damaged_directory_is_told_and_left_alone(training, tmp_path):
     assert [seed for _, seed in training.calls] == [1]
 
 
+def test_a_run_with_a_damaged_table_does_not_count_as_finished(tmp_path):
+    whole = Path(__file__).parents[1] / "data" / "run-schema-2"
+    job = Job.of(RunDir(whole).config(), tmp_path)
+    shutil.copytree(whole, job.path)
+    assert job.finished_iterations == 2
+    (job.path / "metrics.jsonl").write_text("{}\n")
+    with pytest.raises(RunError, match=r"metrics.jsonl is damaged"):
+        _ = job.finished_iterations
+
+
 def test_a_run_that_another_process_holds_is_waited_for(training, tmp_path):
     training.answers = {0: [fakes.BUSY, fakes.BUSY]}
     jobs = [fakes.tiny_job(tmp_path, seed) for seed in (0, 1)]
@@ -98,8 +112,8 @@ def test_without_ray_it_says_what_to_install(training, tmp_path, monkeypatch):
     board = fakes.Remembering()
     run_jobs(jobs, Workers(), board)
     assert len(training.calls) == 2
-    assert "pip install 'headway[ray]'" in board.messages[0]
-    with pytest.raises(ConfigError, match=r"pip install 'headway\[ray\]'"):
+    assert "`pip install '.[ray]'` in the clone" in board.messages[0]
+    with pytest.raises(ConfigError, match=r"pip install '\.\[ray\]'"):
         run_jobs([fakes.tiny_job(tmp_path, 2)], Workers(address="auto"), board)
 
 

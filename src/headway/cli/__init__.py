@@ -24,6 +24,7 @@ Control that keeps making headway when the physics changes.
 commands:
   train ENV           train a controller on an environment whose physics vary
   evaluate RUN        test a trained run on training and unseen physics
+  record RUN          film an episode of a trained run, with the heads that it plans with
   diagnose RUN        measure how well a trained run selects heads
   report RUN ...      compare runs on one HTML page
   reproduce NAME      run what is missing of an experiment of the paper, and draw it

@@ -46,9 +46,10 @@ def load_learned(run: RunDir, config: Config, *, ignore_limits: bool = False) ->
     """
     finished = run.finished_iterations
     if finished == 0:
+        run.check()  # finds checkpoints without their manifests
         raise RunError(
-            f"{run.path} has no finished iteration yet; go on training it with the same"
-            " `headway train` command."
+            f"{run.path} has no finished iteration yet, because nothing is in manifests/; go on"
+            " training it with the same `headway train` command, or complete the copy."
         )
     task = load_task(config)
     if not ignore_limits:

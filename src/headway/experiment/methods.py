@@ -340,6 +340,23 @@ def config_to_evaluate(config: Config, settings: Settings) -> Config:
     return override(config, settings)
 
 
+def config_to_control(config: Config, settings: Settings) -> Config:
+    """The settings of a trained run with some of its planner's replaced, for a controller.
+
+    Args:
+        config: The settings that the run was trained with.
+        settings: Changes by dotted name, of the section `planner` only.
+
+    Raises:
+        ConfigError: As `config_to_evaluate`; or a setting means nothing to a controller.
+    """
+    changed = config_to_evaluate(config, settings)
+    for name in settings:
+        if not name.startswith("planner."):
+            raise ConfigError(f"{name} means nothing to a controller, allowed: planner settings.")
+    return changed
+
+
 def told_sim_params(config: Config) -> tuple[str, ...]:
     """The simulator parameters that the model is told, by name; none but with `sim-params`."""
     if config.model.context != "sim-params":

@@ -6,15 +6,13 @@ One vector environment and one compiled agent serve collection and evaluation al
 import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
-from headway import envs
 from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import BadEnvironmentError
@@ -24,6 +22,9 @@ from headway.planning.controller import env_action
 from headway.sim_params import SimParamSets
 from headway.tasks.base import Task
 from headway.tasks.catalog import EnvSpec, env_options, env_spec, episode_length, sim_param_sets
+
+if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Arena:
 
     spec: EnvSpec
     task: Task
-    vector: VectorEnv
+    vector: "VectorEnv"
     sim_params: SimParamSets
     episode_length: int
 
@@ -53,6 +54,10 @@ class Arena:
         Raises:
             BadEnvironmentError: The environment's spaces do not fit its Task.
         """
+        from gymnasium.vector import AutoresetMode  # a controller is loaded without a simulator
+
+        from headway import envs
+
         spec, collection = env_spec(config.env), config.collection
         options = env_options(config)
         task = spec.make_task(**options)

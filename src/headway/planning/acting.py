@@ -68,6 +68,7 @@ class RandomAgent(eqx.Module):
 
     task: Task
     sim_param_names = ()
+    method = "random"
 
     def init(
         self, num_envs: int, *, key: PRNGKeyArray, sim_params: Physics | None = None

@@ -1,4 +1,6 @@
-"""Whether an observation is one that a model can know anything of."""
+"""Whether what a controller is told is something that a model can know anything of."""
+
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -6,11 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from headway.errors import ConfigError, shown
 from headway.models.networks import Normalizer
 from headway.tasks.base import Task
 
 CONSTANT = 0.01
 """How far a feature that never varied in training may be off, relative to its value or to 1."""
+
+MARGIN = 0.1
+"""How far an action that was measured may lie outside of its bounds, relative to their distance."""
 
 
 class RangeCheck:
@@ -58,3 +64,43 @@ def not_finite(obs: Float[np.ndarray, " obs"]) -> str | None:
         return None
     entry = int(np.argmin(finite))
     return f"obs[{entry}] is {obs[entry]}, allowed: finite numbers"
+
+
+def one_row(name: str, given: Any, size: int, advice: str) -> Float[np.ndarray, " size"]:
+    """What was given as one row of float32.
+
+    Args:
+        name: What it is called.
+        given: Anything.
+        size: Entries that it must have.
+        advice: What to do if it is something else.
+
+    Raises:
+        ConfigError: It has another shape, or is no numbers.
+    """
+    try:
+        with np.errstate(over="ignore"):  # what is too large becomes infinite
+            entries = np.asarray(given).astype(np.float32)
+    except (TypeError, ValueError):
+        raise ConfigError(f"{name} is {shown(given)}, allowed: {size} numbers; {advice}.") from None
+    if entries.shape != (size,):
+        raise ConfigError(f"{name} has shape {entries.shape}, allowed: ({size},); {advice}.")
+    return entries
+
+
+def in_bounds(name: str, action: Float[np.ndarray, " action"], task: Task) -> None:
+    """Refuse an action that cannot be in the environment's own units.
+
+    Raises:
+        ConfigError: An entry lies outside of its bounds by more than `MARGIN`.
+    """
+    low, high = np.asarray(task.action_low), np.asarray(task.action_high)
+    margin = MARGIN * (high - low)
+    outside = (action < low - margin) | (action > high + margin)
+    if outside.any():
+        entry = int(np.argmax(outside))
+        raise ConfigError(
+            f"{name}[{entry}] is {action[entry]:g}, allowed: from {low[entry]:g} to"
+            f" {high[entry]:g}, and {margin[entry]:g} beyond for what was measured; pass it in the"
+            " environment's units, as `act` returns it."
+        )

@@ -6,15 +6,16 @@ from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from headway.config import PlannerConfig
-from headway.errors import ConfigError, PlanningError, shown
+from headway.errors import ConfigError, PlanningError
 from headway.planning.acting import Acting
 from headway.planning.agent import Agent, hold
-from headway.planning.checking import RangeCheck, not_finite
+from headway.planning.checking import RangeCheck, in_bounds, not_finite, one_row
 from headway.planning.deadline import DeadlinePlanner
 from headway.tasks.base import Task
 
@@ -35,6 +36,18 @@ class Status(NamedTuple):
     """From the call of `act` to the action."""
 
 
+class _Found(NamedTuple):
+    """What planning came to."""
+
+    action: Float[np.ndarray, " action"]
+    """In [-1, 1]."""
+    failures: int
+    """Iterations without any finite return."""
+    iterations: int
+    complete: bool
+    """Whether the search ended by itself."""
+
+
 class Controller:
     """Acts with a trained agent, one step at a time.
 
@@ -48,7 +61,8 @@ class Controller:
         agent: The trained agent.
         seed: Seeds the planner's draws.
         deadline_ms: Milliseconds after which `act` answers with the best plan so far; None plans
-            to the end. Everything is compiled and timed first, while the controller is built.
+            to the end. Everything that `act` can need is compiled and timed first, while the
+            controller is built.
             Where no earlier plan is left, as in the first step, one iteration is made even if
             it is late. The promise is that of a program in Python: `status.seconds` has what a
             step took, with any pause of the system.
@@ -68,13 +82,14 @@ class Controller:
         max_deviations: float | None = 10.0,
     ):
         self.agent = agent
-        self._seed = seed
-        self._episode = -1
+        self._seed, self._episode = seed, -1
         self._range = self._deadline = None
         if isinstance(agent, Agent) and max_deviations is not None:
             self._range = RangeCheck(agent.task, agent.statistics.features, max_deviations)
         if deadline_ms is not None:
             self._deadline = self._planner_to(deadline_ms)
+            self._rehearse(self._deadline)
+        self._episode = -1
         self.reset()
 
     def reset(self, sim_params: Mapping[str, float] | None = None) -> None:
@@ -96,51 +111,49 @@ class Controller:
         self._status: Status | None = None
         self._left = 0  # steps of the last plan that are still to come
 
-    def act(self, obs: ArrayLike) -> Float[np.ndarray, " action"]:
+    def act(
+        self, obs: ArrayLike, *, applied_action: ArrayLike | None = None
+    ) -> Float[np.ndarray, " action"]:
         """Choose the next action.
 
         Args:
             obs: The observation, as the environment returned it; one number per entry.
+            applied_action: The action that led here, in the environment's own units, where it is
+                not the one that the last call returned: a safety layer limited it, or an
+                operator took over. Heads are chosen and contexts computed from what was applied.
+                An entry that is not finite says that it is not known; nothing is learned from
+                that step then. At the first call of an episode no action counts.
 
         Returns:
             The action, in the environment's own units and within its bounds.
 
         Raises:
-            ConfigError: The observation has another shape, or the model wants to be told the
-                simulator parameters and was not.
+            ConfigError: The observation or the applied action has another shape, the applied
+                action is out of bounds, or the model wants to be told the simulator parameters
+                and was not.
             PlanningError: There is no new plan, and no earlier one is left.
         """
         started = time.perf_counter()
         entries = self._checked(obs)
+        if applied_action is not None:
+            self._correct(applied_action)
         problem = not_finite(entries)
         if problem is not None:
             return self._hold(f"{problem}; check the sensor", started)
         warnings = self._range(entries) if self._range else ()
-        if self._deadline is None:
-            self._state, decision = self.agent.act(self._state, entries[None])
-            done, complete = self._num_iterations, True
-        else:
-            at_least = 0 if self._left > 0 else 1  # there is nothing else to do
-            self._state, decision, done, complete = self._deadline.act(
-                self._state, entries[None], started, at_least
-            )
-        scaled, heads, failures = jax.device_get(
-            (decision.action[0], decision.heads, decision.failures[0])
-        )
-        self._heads = None if heads is None else heads[0]
-        failures = int(failures)
-        reason = ""
+        found = self._plan(entries, started)
+        done, reason = found.iterations, ""
         if done == 0:
             reason = "no iteration of the planner fits the deadline"
-        elif failures >= done:
+        elif found.failures >= done:
             reason = f"none of {done} iterations of the planner found a finite return"
-        elif not complete:
+        elif not found.complete:
             reason = f"time was up after {done} of {self._num_iterations} iterations"
-        failed = done == 0 or failures >= done
+        failed = found.failures >= done
         self._count(failed, reason)
-        outcome = "held" if failed else "planned" if complete else "deadline"
+        outcome = "held" if failed else "planned" if found.complete else "deadline"
         self._status = Status(outcome, reason, warnings, done, time.perf_counter() - started)
-        return env_action(self.agent.task, scaled)
+        return env_action(self.agent.task, found.action)
 
     @property
     def status(self) -> Status | None:
@@ -173,13 +186,44 @@ class Controller:
                 f"deadline_ms is {deadline_ms}, allowed: milliseconds above 0, or None for none."
             )
         if not isinstance(self.agent, Agent):
+            name = getattr(self.agent, "method", type(self.agent).__name__)
             raise ConfigError(
-                f"a {type(self.agent).__name__} cannot plan to a deadline, allowed: an agent that"
-                " was trained; pass deadline_ms=None."
+                f"deadline_ms is {deadline_ms:g}, but {name} cannot be cut off in the middle of a"
+                " plan, allowed: None; or take a method that can, such as tmcl or pets."
             )
-        planner = DeadlinePlanner(self.agent, deadline_ms / 1000)
+        return DeadlinePlanner(self.agent, deadline_ms / 1000)
+
+    def _rehearse(self, planner: DeadlinePlanner) -> None:
+        """Live through all that `act` can meet, so that everything is compiled and timed."""
+        self.reset(dict.fromkeys(self.agent.sim_param_names, 1.0))
+        obs = np.zeros(self.agent.task.obs_size, np.float32)
+        soon, late = float("inf"), -float("inf")
+        for left, started in ((0, soon), (1, soon), (1, late), (0, late)):
+            if self._range:
+                self._range(obs)
+            self._left = left
+            self._plan(obs, started)
+        for action in (self.agent.task.action_low, np.full(self.agent.task.action_size, np.nan)):
+            self._correct(action)
+        self._left = 1
+        self._hold("a rehearsal", soon)
         planner.warm_up()
-        return planner
+
+    def _plan(self, obs: Float[np.ndarray, " obs"], started: float) -> "_Found":
+        """Search for a plan, as long as there is time, and remember where that led."""
+        if self._deadline is None:
+            self._state, decision = self.agent.act(self._state, obs[None])
+            done, complete = self._num_iterations, True
+        else:
+            at_least = 0 if self._left > 0 else 1  # there is nothing else to do
+            self._state, decision, done, complete = self._deadline.act(
+                self._state, obs[None], started, at_least
+            )
+        action, heads, failures = jax.device_get(
+            (decision.action[0], decision.heads, decision.failures[0])
+        )
+        self._heads = None if heads is None else heads[0]
+        return _Found(action, int(failures), done, complete)
 
     def _checked(self, obs: Any) -> np.ndarray:
         """An observation of the right shape, of a controller that was told what it must be."""
@@ -189,21 +233,22 @@ class Controller:
                 f"the controller was told no sim_params, allowed: a value for each of {names},"
                 ' which its model takes as input; call reset(sim_params=info["sim_params"]) first.'
             )
-        size = self.agent.task.obs_size
-        try:
-            with np.errstate(over="ignore"):  # what is too large becomes infinite
-                entries = np.asarray(obs).astype(np.float32)
-        except (TypeError, ValueError):
-            raise ConfigError(
-                f"obs is {shown(obs)}, allowed: {size} numbers; pass one observation as the"
-                " environment returns it."
-            ) from None
-        if entries.shape != (size,):
-            raise ConfigError(
-                f"obs has shape {entries.shape}, allowed: ({size},); pass one observation as the"
-                " environment returns it."
-            )
-        return entries
+        advice = "pass one observation as the environment returns it"
+        return one_row("obs", obs, self.agent.task.obs_size, advice)
+
+    def _correct(self, applied_action: Any) -> None:
+        """Let the last step be remembered with the action that was applied, if it is known."""
+        task = self.agent.task
+        advice = "pass one action in the environment's units, as `act` returns it"
+        action = one_row("applied_action", applied_action, task.action_size, advice)
+        if self._planner is None:  # an agent that remembers no actions
+            return
+        if np.isfinite(action).all():
+            in_bounds("applied_action", action, task)
+            scaled = jnp.asarray(scaled_action(task, action)[None])
+            self._state = self._state._replace(action=scaled)
+        else:
+            self._state = self._state._replace(acted=jnp.asarray(np.zeros(1, bool)))
 
     def _hold(self, reason: str, started: float) -> Float[np.ndarray, " action"]:
         """The next action of the last plan."""
@@ -240,3 +285,11 @@ def env_action(
     low, high = np.asarray(task.action_low), np.asarray(task.action_high)
     scaled = low + 0.5 * (action.astype(np.float64) + 1.0) * (high - low)
     return np.clip(scaled, low, high).astype(np.float32)
+
+
+def scaled_action(
+    task: Task, action: Float[np.ndarray, "*batch action"]
+) -> Float[np.ndarray, "*batch action"]:
+    """`Task.unscale_action` in NumPy."""
+    low, high = np.asarray(task.action_low), np.asarray(task.action_high)
+    return (2.0 * (action.astype(np.float64) - low) / (high - low) - 1.0).astype(np.float32)

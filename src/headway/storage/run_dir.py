@@ -112,8 +112,9 @@ class RunDir:
 
     @property
     def finished_iterations(self) -> int:
-        """Iterations that are complete."""
-        return len(self.metrics())
+        """Iterations that are complete; but for schema 1, no table is read for that."""
+        manifest = self.manifest()
+        return len(self.metrics()) if manifest is None else manifest.iteration + 1
 
     def check(self) -> None:
         """Read everything once, so that damage is found before work is done.
@@ -128,7 +129,7 @@ class RunDir:
         self.evaluation()
         self.assignments()
         self.prediction_errors()
-        finished = self.finished_iterations
+        finished = len(self.metrics())
         beyond = [path for path in self._iterations.files("checkpoints") if number(path) > finished]
         if beyond:
             place = "manifests" if self._schema == SCHEMA else "metrics.jsonl"

@@ -62,7 +62,7 @@ class Job:
                 f"{self.path} holds a run with other settings ({'; '.join(found)}), perhaps of an"
                 " older version; choose another --out, or move it away."
             )
-        return run.finished_iterations
+        return len(run.metrics())
 
     @property
     def finished(self) -> bool:

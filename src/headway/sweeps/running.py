@@ -18,7 +18,7 @@ from headway.sweeps.jobs import Job
 from headway.sweeps.status import Status, StatusProgress, Tell
 
 PATIENCE = 5.0  # seconds before a run is tried again that another process holds
-INSTALL_RAY = "pip install 'headway[ray]'"
+INSTALL_RAY = "`pip install '.[ray]'` in the clone of Headway"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +66,9 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, board: Board) -> None:
         run_here(missing, board, seeds_together=True)
     elif workers.one_by_one or not ray_is_installed():
         if workers.address:
-            raise ConfigError(f"a Ray cluster needs Ray, which is missing; {INSTALL_RAY}.")
+            raise ConfigError(
+                f"a Ray cluster needs Ray, which is missing; {INSTALL_RAY} installs it."
+            )
         if not workers.one_by_one and len(missing) > 1:
             board.message(f"runs go one after another; {INSTALL_RAY} lets them go side by side")
         run_here(missing, board)

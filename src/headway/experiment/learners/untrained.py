@@ -8,7 +8,6 @@ from headway.data import Trajectory
 from headway.errors import ConfigError
 from headway.experiment.learners.base import Fit, Learned, Learner
 from headway.experiment.rollouts import Arena
-from headway.experiment.true_dynamics import SimulatorAgent, make_simulator
 from headway.planning.acting import Acting, RandomAgent
 
 
@@ -65,4 +64,6 @@ class Simulator(Untrained):
                 "a run on the true dynamics has no controller of its own, allowed: testing it in"
                 " its simulator; use `headway evaluate`."
             )
+        from headway.experiment.true_dynamics import SimulatorAgent, make_simulator
+
         return SimulatorAgent(make_simulator(arena, self.config.planner), self.config.planner)

@@ -39,6 +39,11 @@ class AdaptiveAgent(eqx.Module):
     planner: PlannerConfig = eqx.field(static=True)
     sim_param_names = ()
 
+    @property
+    def method(self) -> str:
+        """The name of the method that made the model."""
+        return self.model.method
+
     def init(
         self, num_envs: int, *, key: PRNGKeyArray, sim_params: Physics | None = None
     ) -> AdaptiveState:
