@@ -41,6 +41,7 @@ ARMS: dict[str, dict[str, Any]] = {
     | {"planner.adaptation_variance": True, "planner.risk_aversion": 1.0},
     "last-layer, risk 1": LAST_LAYER | {"planner.risk_aversion": 1.0},
     "risk 1": {"planner.risk_aversion": 1.0},
+    "last-layer, forgetting 0.05": LAST_LAYER | {"planner.forgetting": 0.05},
     "last-layer, forgetting 0.001": LAST_LAYER | {"planner.forgetting": 0.001},
     "last-layer, change detection": LAST_LAYER | {"planner.change_threshold": 20.0},
 }
