@@ -37,6 +37,14 @@ def test_a_run_that_does_not_fit_is_refused_with_the_numbers(monkeypatch, tmp_pa
         )
 
 
+@pytest.fixture
+def no_memory(monkeypatch):
+    """Nothing is free, and nothing is held that could be given back."""
+    monkeypatch.setattr(limits, "free_memory", lambda: 0)
+    monkeypatch.setattr(limits, "resident", lambda: 0)
+
+
+@pytest.mark.usefixtures("no_memory")
 def test_a_run_that_does_not_fit_may_be_tried_all_the_same(monkeypatch, tmp_path):
     class BegunError(Exception):
         pass
@@ -44,8 +52,6 @@ def test_a_run_that_does_not_fit_may_be_tried_all_the_same(monkeypatch, tmp_path
     def begin(*_):
         raise BegunError
 
-    monkeypatch.setattr(limits, "free_memory", lambda: 0)
-    monkeypatch.setattr(limits, "resident", lambda: 0)
     monkeypatch.setattr(training.Trainer, "open", begin)
     config = make_config("pendulum", preset="smoke")
     with pytest.raises(LimitError):
@@ -54,6 +60,7 @@ def test_a_run_that_does_not_fit_may_be_tried_all_the_same(monkeypatch, tmp_path
         training.train_run(config, tmp_path / "run", ignore_limits=True)
 
 
+@pytest.mark.usefixtures("no_memory")
 def test_a_begun_run_goes_on_where_limits_are_ignored(monkeypatch, tmp_path):
     class LoadedError(Exception):
         pass
@@ -61,8 +68,6 @@ def test_a_begun_run_goes_on_where_limits_are_ignored(monkeypatch, tmp_path):
     def load(*_):
         raise LoadedError
 
-    monkeypatch.setattr(limits, "free_memory", lambda: 0)
-    monkeypatch.setattr(limits, "resident", lambda: 0)
     monkeypatch.setattr(RunDir, "finished_iterations", 1)
     monkeypatch.setattr(RunDir, "load_data", lambda run: [])
     monkeypatch.setattr(RunDir, "check", lambda run: None)
