@@ -7,8 +7,9 @@ import pytest
 
 import headway
 from headway.cli import main
-from headway.errors import ConfigError
+from headway.errors import ConfigError, RunError, UnknownNameError
 from headway.report import diagnosis
+from headway.storage.run_dir import RunDir
 
 SAMPLE = Path(__file__).parent.parent / "data" / "run-schema-2"  # two of three iterations
 
@@ -74,3 +75,61 @@ def test_only_models_with_heads_are_diagnosed(tmp_path):
 def test_only_runs_are_diagnosed(tmp_path, capsys):
     assert main(["diagnose", str(tmp_path)]) == 1
     assert "config.json is missing" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def tested(tmp_path_factory):
+    path = tmp_path_factory.mktemp("tested") / "run"
+    settings = {"evaluation.num_episodes": 3, "collection.num_iterations": 2}
+    headway.train("pendulum", preset="smoke", run_dir=path, settings=settings)
+    return path
+
+
+def test_the_tests_of_a_run_are_not_run_again(tested, monkeypatch):
+    run = RunDir(tested)
+    kept = run.tests()
+    assert [t.returns for found in kept.values() for t in found] == [
+        row.episode_return for row in run.evaluation() if row.iteration == 1
+    ]
+
+    def never(*args, **kwargs):
+        raise AssertionError("tests were run")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(diagnosis, "run_tests", never)
+        found = headway.diagnose(tested)
+        assert {group: len(episodes) for group, episodes in found.episodes.items()} == {
+            "train": 3,
+            "low": 3,
+            "high": 3,
+        }
+        assert list(headway.diagnose(tested, groups=["high"]).episodes) == ["high"]
+        with pytest.raises(UnknownNameError):
+            headway.diagnose(tested, groups=["hihg"])
+    assert headway.diagnose(tested, groups=["high"], num_episodes=1).summary("high").episodes == 1
+
+
+def test_how_heads_would_be_selected(tested):
+    selected, learning, drawn = (
+        headway.diagnose(tested, groups=["high"], settings=settings).summary("high")
+        for settings in (
+            {},
+            {"planner.adaptation": "last-layer"},
+            {"planner.head_selection": "random"},
+        )
+    )
+    assert learning.chosen_error < 0.7 * selected.chosen_error
+    np.testing.assert_array_equal(drawn.head_errors, selected.head_errors)
+    assert drawn.wrong > selected.wrong
+    with pytest.raises(ConfigError, match="fixed by training"):
+        headway.diagnose(tested, settings={"model.num_heads": 2})
+
+
+def test_damaged_tests_are_noticed(tested, tmp_path):
+    path = Path(shutil.copytree(tested, tmp_path / "run"))
+    damaged = path / "tests" / "iteration-001.safetensors"
+    content = bytearray(damaged.read_bytes())
+    content[-1] ^= 1
+    damaged.write_bytes(content)
+    with pytest.raises(RunError, match=r"tests/iteration-001\.safetensors is damaged"):
+        headway.diagnose(path)

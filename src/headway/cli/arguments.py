@@ -64,8 +64,8 @@ SECTIONS = {
 }
 
 
-WithSettings = TypeVar("WithSettings", bound="Train | Evaluate | Record")
-AboutRun = TypeVar("AboutRun", bound="Evaluate | Record")
+WithSettings = TypeVar("WithSettings", bound="Train | Evaluate | Record | Diagnose")
+AboutRun = TypeVar("AboutRun", bound="Evaluate | Record | Diagnose")
 
 
 def with_settings(arguments: WithSettings, config: Config) -> WithSettings:
@@ -209,22 +209,29 @@ class Report:
 class Diagnose:
     """Measure how well a trained run selects heads, and how well it knows its own error.
 
-    Its own test episodes are run again, with fixed seeds; nothing in its directory changes.
+    It looks at the run's own last test episodes; nothing in its directory changes. With planner
+    settings: how heads would be selected in these episodes. The defaults shown are those of the
+    run named before --help.
     """
 
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """The run directory."""
     group: Annotated[tuple[str, ...], default_text("all of them")] = ()
     """Groups of physics: `train` or unseen groups."""
-    episodes: Annotated[int | None, default_text("as in the run's own tests")] = None
-    """Episodes per group."""
+    episodes: Annotated[int | None, default_text("the run's own tests, not run again")] = None
+    """Run tests with so many episodes per group."""
     collected: Flag = False
-    """Take the episodes that the last iteration collected instead of running tests: done at once,
-    but training physics only, and the model has learned from them since."""
+    """Take the episodes that the last iteration collected: training physics only, and the model has
+    learned from them since."""
     json: Flag = False
     """Print one JSON line on stdout instead of tables."""
     quiet: Flag = False
     """Show no progress."""
+    planner: PlannerSettings = dataclasses.field(default_factory=PlannerSettings)
+
+    def with_defaults(self, config: Config) -> "Diagnose":
+        """The same arguments with the settings of a run."""
+        return with_settings(self, config)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,7 +26,7 @@ def report(words: Sequence[str]) -> int:
 
 def diagnose(words: Sequence[str]) -> int:
     """`headway diagnose`."""
-    arguments = parse(Diagnose, Diagnose(run=tyro.MISSING), words, "headway diagnose")
+    arguments, settings = parse_for_run(Diagnose(run=tyro.MISSING), words, "headway diagnose")
     from headway.experiment.progress import make_progress
     from headway.report import diagnosis
 
@@ -35,6 +35,7 @@ def diagnose(words: Sequence[str]) -> int:
         groups=arguments.group or None,
         num_episodes=arguments.episodes,
         collected=arguments.collected,
+        settings=settings,
         progress=make_progress(arguments.quiet),
     )
     if arguments.json:

@@ -1,7 +1,8 @@
 """How well heads are selected, and how well a model knows its own error, on test episodes.
 
-Every transition is predicted by all heads before it happens, with the context and the selection
-that the agent had at that moment. Errors are mean squares over dimensions in normalised units.
+Every transition is predicted by all heads before it happens, with the context, the selection and
+the corrections that the agent had at that moment. Errors are mean squares over dimensions in
+normalised units.
 """
 
 import dataclasses
@@ -15,9 +16,10 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scipy import stats
 
 from headway.data import Trajectory, sim_params_row
-from headway.models.dynamics import network_input
 from headway.planning.agent import Agent, choose_heads, encode
 from headway.planning.heads import RecentTransitions
+from headway.planning.last_layer.learning import Learned, learn
+from headway.planning.last_layer.regression import Seen, foresee
 
 LEVELS = (0.5, 0.9, 0.95)  # central intervals that are counted
 
@@ -151,21 +153,55 @@ def _predict(
     Float[Array, "time member obs"] | None,
 ]:
     """Errors of all heads, the selected ones, and the latter's errors in standard deviations."""
-    model, statistics = agent.model, agent.statistics
     recent = _pasts(agent, obs, action)
     context = encode(agent, recent, sim_params)
-    head_key, error_key = jax.random.split(key)
-    chosen = choose_heads(agent, recent, context, error_key=error_key, head_key=head_key)
-    x = network_input(agent.task, statistics, obs[:-1], action)
-    prediction = model.forward_net(jnp.broadcast_to(x, (model.num_members, *x.shape)), context)
-    delta = statistics.delta.normalize(agent.task.target(obs[:-1], obs[1:]))
-    difference = (delta - prediction.mean).transpose(2, 0, 1, 3)
+    transition = obs[:-1], action, obs[1:]
+    seen = Seen.through(agent.model, agent.task, agent.statistics, transition, context)
+    chosen, foreseen = _live(agent, recent, context, seen, key)
+    difference = seen.residual - foreseen
     errors = jnp.square(difference).mean(-1)
-    if prediction.logvar is None:
+    if seen.logvar is None:
         return errors, chosen, None
-    deviations = difference * jnp.exp(-0.5 * prediction.logvar).transpose(2, 0, 1, 3)
+    deviations = difference * jnp.exp(-0.5 * seen.logvar)
     index = chosen[:, :, None, None]
     return errors, chosen, jnp.take_along_axis(deviations, index, axis=2)[:, :, 0]
+
+
+def _live(
+    agent: Agent,
+    recent: RecentTransitions,
+    context: Float[Array, "member time context"] | None,
+    seen: Seen,
+    key: PRNGKeyArray,
+) -> tuple[Int[Array, "time member"], Float[Array, "time member head obs"]]:
+    """Go through an episode as the agent does: learn from each step, then select.
+
+    Args:
+        agent: The agent.
+        recent: What it remembers before each step; steps take the place of environments.
+        context: The context at each step.
+        seen: The transition that each step leads to.
+        key: Draws of a selection that is random or sampled.
+
+    Returns:
+        The selected heads, and how much the heads' corrections add to what they predict; 0 for
+        heads that do not learn while they act.
+    """
+    steps = jnp.arange(len(recent.count))
+
+    def step(learned: Learned, time: Int[Array, ""]):
+        now, known = jax.tree.map(lambda x: x[time][None], (recent, seen))
+        told = None if context is None else context[:, time][:, None]
+        learned = learn(agent, learned, now, told, time[None] > 0)
+        head_key, error_key = jax.random.split(jax.random.fold_in(key, time))
+        heads = choose_heads(
+            agent, now, told, error_key=error_key, head_key=head_key, learned=learned
+        )
+        if learned.layer is None:
+            return learned, (heads[0], jnp.zeros_like(known.residual[0]))
+        return learned, (heads[0], foresee(learned.layer, known.features)[0])
+
+    return jax.lax.scan(step, Learned.nothing(agent, 1), steps)[1]
 
 
 def _pasts(

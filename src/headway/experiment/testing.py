@@ -70,7 +70,7 @@ def run_tests(
     arena = Arena.make(config)
     with progress or Progress() as shown, closing(arena):
         agent = load_agent(run, config, arena)
-        groups = _known_groups(groups, arena.sim_params.group_names)
+        groups = known_groups(groups, arena.sim_params.group_names)
         iteration = run.finished_iterations - 1
         total = len(groups) * config.evaluation.num_episodes * arena.episode_length
         shown.phase(iteration, run.finished_iterations, "evaluate", total)
@@ -79,8 +79,12 @@ def run_tests(
     return Tested(config, iteration, agent, arena, found, use)
 
 
-def _known_groups(wanted: Sequence[str] | None, known: Sequence[str]) -> list[str]:
+def known_groups(wanted: Sequence[str] | None, known: Sequence[str]) -> list[str]:
     """The wanted groups, each once; all by default.
+
+    Args:
+        wanted: `train` or unseen groups, as they were asked for.
+        known: All that there are.
 
     Raises:
         UnknownNameError: No such group.

@@ -297,6 +297,7 @@ class Trainer:
         run, config, learner = self.run, self.config, self.learner
         arrays.save_tree(run.checkpoint(iteration), self.learned)
         run.append_evaluation(episode_rows(config, iteration, tested))
+        run.save_tests(iteration, tested)
         shares = learner.head_shares(self.learned, self.buffer.trajectories)
         run.append_assignments([{"iteration": iteration, **row} for row in shares])
         errors = [

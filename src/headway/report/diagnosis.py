@@ -12,6 +12,7 @@ from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import ConfigError
 from headway.experiment.loading import load_agent
+from headway.experiment.methods import config_to_control
 from headway.experiment.progress import Progress
 from headway.experiment.selection import (
     LEVELS,
@@ -20,11 +21,12 @@ from headway.experiment.selection import (
     examine,
     summarise,
 )
-from headway.experiment.testing import run_tests
+from headway.experiment.testing import known_groups, run_tests
 from headway.planning.agent import Agent
 from headway.report.physics import distinct, full_label, varying
 from headway.report.tables import new_table
 from headway.storage.run_dir import RunDir
+from headway.tasks.catalog import sim_param_sets
 
 Facts = dict[str, Any]
 
@@ -69,34 +71,47 @@ def diagnose(
     groups: Sequence[str] | None = None,
     num_episodes: int | None = None,
     collected: bool = False,
+    settings: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Examine head selection and predicted variances on a run's own test episodes.
 
-    The episodes are run again with the run's protocol and fixed seeds; before every step, all
-    heads predict what it leads to. Nothing in the directory changes.
+    Before every step of them, all heads predict what it leads to. The episodes are those that the
+    run was tested with after its last iteration. Where it kept none, or another number is
+    asked for, tests are run with the run's protocol. Nothing in the directory changes.
 
     Args:
         run_dir: The run directory.
         groups: `train` or unseen groups; all of them by default.
-        num_episodes: Episodes per group; the run's own number by default.
-        collected: Take the episodes that the last iteration collected, instead of running tests.
-            That is done at once, but the model has learned from these episodes since.
+        num_episodes: Episodes per group to run tests with; by default those of the run are taken.
+        collected: Take the episodes that the last iteration collected instead. The model has
+            learned from these since.
+        settings: Changes of `planner` settings by dotted name: how heads would be selected, and
+            learn, in these same episodes. Actions stay as they were, but for tests that are run.
         progress: Shown while testing; silent by default.
 
     Raises:
         RunError: There is no trained run, or it is damaged.
         UnknownNameError: No such group.
-        ConfigError: `collected` leaves no choice of groups and episodes, or the run's method has
-            no model with heads.
+        ConfigError: A setting is unknown, of the wrong type or out of range, or one that training
+            has fixed; `collected` leaves no choice of groups and episodes; or the run's method
+            has no model with heads.
         LimitError: Planning needs more memory than is free.
     """
-    _check_heads(RunDir(run_dir))
+    run = RunDir(run_dir)
+    _check_heads(run)
+    config = config_to_control(run.config(), settings or {})
     if collected:
-        return _of_collected(run_dir, groups, num_episodes)
-    tested = run_tests(run_dir, groups=groups, num_episodes=num_episodes, progress=progress)
-    assert isinstance(tested.agent, Agent)
-    return _examined(Path(run_dir), tested.config, tested.agent, tested.trajectories)
+        return _examined(run, config, _collected(run, groups, num_episodes))
+    kept = run.tests() if num_episodes is None else {}
+    if kept:
+        wanted = known_groups(groups, sim_param_sets(config).group_names)
+        if kept.keys() >= set(wanted):
+            return _examined(run, config, {group: kept[group] for group in wanted})
+    tested = run_tests(
+        run_dir, groups=groups, num_episodes=num_episodes, settings=settings, progress=progress
+    )
+    return _examined(run, tested.config, tested.trajectories)
 
 
 def _check_heads(run: RunDir) -> None:
@@ -107,31 +122,28 @@ def _check_heads(run: RunDir) -> None:
         )
 
 
-def _of_collected(
-    run_dir: str | Path, groups: Sequence[str] | None, num_episodes: int | None
-) -> Diagnosis:
+def _collected(
+    run: RunDir, groups: Sequence[str] | None, num_episodes: int | None
+) -> dict[str, list[Trajectory]]:
     if groups or num_episodes is not None:
         raise ConfigError(
             "groups or episodes are chosen together with `collected`, allowed: one of them; the"
             " collected episodes are all of training physics."
         )
-    run = RunDir(run_dir)
-    config = run.config()
-    agent = load_agent(run, config)
-    assert isinstance(agent, Agent)
-    trajectories = {COLLECTED: run.iteration_data(run.finished_iterations - 1)}
-    return _examined(run.path, config, agent, trajectories)
+    return {COLLECTED: run.iteration_data(run.finished_iterations - 1)}
 
 
 def _examined(
-    path: Path, config: Config, agent: Agent, trajectories: Mapping[str, list[Trajectory]]
+    run: RunDir, config: Config, trajectories: Mapping[str, list[Trajectory]]
 ) -> Diagnosis:
+    agent = load_agent(run, config)
+    assert isinstance(agent, Agent)
     key = jax.random.key(config.evaluation.seed)
     episodes = {
         group: examine(agent, found, key=jax.random.fold_in(key, i))
         for i, (group, found) in enumerate(trajectories.items())
     }
-    return Diagnosis(path, config, {group: found for group, found in episodes.items() if found})
+    return Diagnosis(run.path, config, {group: found for group, found in episodes.items() if found})
 
 
 def facts(diagnosis: Diagnosis) -> Facts:

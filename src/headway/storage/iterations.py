@@ -92,11 +92,11 @@ class Iterations:
         self._write(count - 1, {**digests, "config.json": Digest.of_bytes(config)})
 
     def drop_old(self) -> None:
-        """Delete manifests and checkpoints that nobody goes back to."""
+        """Delete manifests, checkpoints and tests that nobody goes back to."""
         numbers = self.numbers
         if numbers:
             kept = range(numbers[-1] - KEPT + 1, numbers[-1] + 2)
-            for folder in ("manifests", "checkpoints"):
+            for folder in ("manifests", "checkpoints", "tests"):
                 found = self.files(folder)
                 files.remove(path for path in found if number(path) not in kept)
 
@@ -129,6 +129,7 @@ class Iterations:
     def _digests(self, iteration: int, data: range) -> dict[str, Digest]:
         """The files of an iteration as they are now, with the data of some iterations."""
         found = [path for path in self.files("data") if number(path) in data]
+        found += [path for path in self.files("tests") if number(path) == iteration]
         names = ["config.json", *TABLES, checkpoint_name(iteration)]
         names += [path.relative_to(self._root).as_posix() for path in found]
         return {name: Digest.of(inside(self._root, name)) for name in names}
@@ -137,6 +138,11 @@ class Iterations:
 def checkpoint_name(iteration: int) -> str:
     """The file, inside the run directory, with what was learned after an iteration."""
     return f"checkpoints/iteration-{iteration:03d}.safetensors"
+
+
+def tests_name(iteration: int) -> str:
+    """The two files, inside the run directory and without suffix, with an iteration's tests."""
+    return f"tests/iteration-{iteration:03d}"
 
 
 def manifest_name(iteration: int) -> str:

@@ -17,7 +17,13 @@ from headway.errors import ConfigError, RunError
 from headway.storage import config_file, files, records
 from headway.storage.config_file import SCHEMA, UNCHECKED
 from headway.storage.interrupts import StopRequest
-from headway.storage.iterations import Iterations, checkpoint_name, manifest_name, number
+from headway.storage.iterations import (
+    Iterations,
+    checkpoint_name,
+    manifest_name,
+    number,
+    tests_name,
+)
 from headway.storage.manifest import Digest, Manifest, inside
 from headway.storage.progress_store import ProgressStore
 from headway.storage.run_lock import LOCK, locked
@@ -32,7 +38,7 @@ from headway.storage.tables import (
 )
 
 PARTIAL = "partial"
-FOLDERS = ("checkpoints", "data", "manifests", PARTIAL, "figures", "tensorboard")
+FOLDERS = ("checkpoints", "data", "tests", "manifests", PARTIAL, "figures", "tensorboard")
 
 
 class RunDir:
@@ -208,6 +214,33 @@ class RunDir:
     def load_data(self) -> list[Trajectory]:
         """All trajectories of the finished iterations, memory-mapped."""
         return [t for i in range(self.finished_iterations) for t in self.iteration_data(i)]
+
+    def save_tests(self, iteration: int, tested: Mapping[str, list[Trajectory]]) -> None:
+        """Keep the test episodes of an iteration, until some iterations later."""
+        episodes = [trajectory for found in tested.values() for trajectory in found]
+        if episodes:
+            records.save_trajectories(inside(self.path, tests_name(iteration)), episodes)
+
+    def tests(self) -> dict[str, list[Trajectory]]:
+        """The test episodes of the last finished iteration, memory-mapped, by group.
+
+        Empty if there were none, or if the run was trained before they were kept.
+
+        Raises:
+            RunError: They are damaged; the message says how to go back.
+        """
+        manifest, found = self.manifest(), {}
+        name = "" if manifest is None else tests_name(manifest.iteration)
+        names = [f"{name}.json", f"{name}.safetensors"]
+        if manifest is None or not manifest.files.keys() & names:
+            return {}
+        with self._iterations.advice():
+            manifest.check(self.path, names)
+        episodes = records.load_trajectories(inside(self.path, name))
+        rows = [row for row in self.evaluation() if row.iteration == manifest.iteration]
+        for row, trajectory in zip(rows, episodes, strict=True):
+            found.setdefault(row.group, []).append(trajectory)
+        return found
 
     def finish(self, iteration: int) -> None:
         """Make an iteration count, once all its files are written."""

@@ -168,12 +168,18 @@ class Forecast(NamedTuple):
     """Predictive variance over the noise variance, n + φᵀPφ."""
 
 
+def foresee(
+    state: LastLayer, features: Float[Array, "env member feature"]
+) -> Float[Array, "env member head obs"]:
+    """What the corrections add to the heads' means, in normalised units."""
+    return jnp.einsum("emi,emhio->emho", features, state.weight)
+
+
 def forecast(state: LastLayer, seen: Observed) -> Forecast:
     """Predict a transition with what was learned so far."""
-    foreseen = jnp.einsum("emi,emhio->emho", seen.features, state.weight)
     projected = jnp.einsum("emgij,emi->emgj", state.root, seen.features)
     spread = seen.noise + jnp.square(projected).sum(-1)
-    return Forecast(seen.residual - foreseen, projected, spread)
+    return Forecast(seen.residual - foresee(state, seen.features), projected, spread)
 
 
 def first_forecast(prior: Prior, seen: Observed) -> Forecast:
