@@ -73,8 +73,16 @@ def family_of(planner: str) -> str:
     return first if first in FAMILIES else "cem"
 
 
-def draw(axes: Axes, points: Sequence[Point]) -> None:
-    """One panel: every planner, its range over runs, and the Pareto line."""
+def numbered(points: dict[str, list[Point]]) -> dict[str, int]:
+    """A number for every planner, by rising cost."""
+    everything = [point for found in points.values() for point in found]
+    by_cost = sorted(everything, key=lambda point: (point.flop, point.planner))
+    names = dict.fromkeys(point.planner for point in by_cost)
+    return {name: number for number, name in enumerate(names, start=1)}
+
+
+def draw(axes: Axes, points: Sequence[Point], numbers: dict[str, int]) -> None:
+    """One panel: every planner with its number, its range over runs, and the Pareto line."""
     for point in points:
         family = family_of(point.planner)
         gflop = point.flop / 1e9
@@ -86,14 +94,14 @@ def draw(axes: Axes, points: Sequence[Point]) -> None:
     front = pareto(points)
     x, y = [point.flop / 1e9 for point in front], [point.value for point in front]
     axes.step(x, y, where="post", color=style.FAINT, lw=1.0, zorder=1)
-    for point in front:
+    for point in points:
         axes.annotate(
-            point.planner,
+            str(numbers[point.planner]),
             (point.flop / 1e9, point.value),
-            (3, 4),
+            (4, 3),
             textcoords="offset points",
-            fontsize=6.5,
-            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5},
+            fontsize=7.5,
+            fontweight="bold" if point in front else "normal",
         )
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
@@ -107,14 +115,19 @@ def save_figure(points: dict[str, list[Point]], value: str, path: Path, source: 
     num_runs = max(len(point.values) for found in points.values() for point in found)
     caption = (
         f"Means over {num_runs} run{'s' * (num_runs > 1)} of {source}; thin lines: lowest and"
-        " highest run. Line and labels: planners that no cheaper one equals. FLOP: matrix products"
-        " of the imagined rollouts that were really evaluated."
+        " highest run. Line and bold numbers: planners that no cheaper one equals. FLOP: matrix"
+        " products of the imagined rollouts that were really evaluated."
     )
     title = f"{value.capitalize()} against planning cost"
-    with style.figure(path, title=title, caption=caption, size=(9.0, 4.4)) as figure:
-        panels = figure.subplots(1, len(points), sharex=True, squeeze=False)[0]
+    numbers = numbered(points)
+    with style.figure(path, title=title, caption=caption, size=(11.0, 4.6)) as figure:
+        widths = [4.0] * len(points) + [2.2]
+        *panels, key = figure.subplots(1, len(widths), width_ratios=widths)
+        key.axis("off")
+        lines = [f"{number}  {planner}" for planner, number in numbers.items()]
+        key.text(0, 1, "\n".join(lines), va="top", fontsize=8, linespacing=1.5)
         for axes, (physics, found) in zip(panels, points.items(), strict=True):
-            draw(axes, found)
+            draw(axes, found, numbers)
             axes.set_title(f"{physics} physics")
             style.label_axis(axes, "GFLOP per step", value)
         shown = [point.planner for found in points.values() for point in found]
