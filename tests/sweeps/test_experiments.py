@@ -8,6 +8,8 @@ import pytest
 
 from headway.errors import ConfigError, RunError, UnknownNameError
 from headway.experiment.methods import METHODS, PRESETS, make_config
+from headway.experiment.training import train_run
+from headway.settings import override
 from headway.sweeps.experiments import EXPERIMENTS, experiment, sweep_experiment
 from headway.sweeps.jobs import Cell, Comparison, Job, fingerprint
 
@@ -86,6 +88,15 @@ def test_a_directory_stands_for_all_settings_but_the_seed(tmp_path):
     ]
     names = {fingerprint(make_config("pendulum", preset="quick", settings=s)) for s in others}
     assert len({fingerprint(plain), *names}) == 4
+
+
+def test_what_a_run_only_tolerates_does_not_separate_runs(tmp_path):
+    plain = make_config("pendulum", method="random", preset="smoke")
+    tolerant = {"evaluation.max_bad_episodes": 1, "collection.env_processes": True}
+    job, same = Job.of(plain, tmp_path), Job.of(override(plain, tolerant), tmp_path)
+    assert same.path == job.path
+    train_run(job.config, job.path)
+    assert same.finished
 
 
 def test_settings_of_an_arm_win_over_those_of_the_comparison(tmp_path):

@@ -1,6 +1,6 @@
 """What an experiment needs: one run per arm, environment and seed, each with its directory.
 
-A run's directory is named by every setting that can change its results, so that whoever needs
+A run's directory is named by every setting that its results depend on, so that whoever needs
 the same run finds it, and two different ones never meet.
 """
 
@@ -56,7 +56,8 @@ class Job:
         if not (self.path / "config.json").exists():
             return 0
         run = RunDir(self.path)
-        found = settings.differences(run.config(), self.config)
+        begun_with = settings.tolerating_as(run.config(), self.config)
+        found = settings.differences(begun_with, self.config)
         if found:
             raise RunError(
                 f"{self.path} holds a run with other settings ({'; '.join(found)}), perhaps of an"
@@ -132,16 +133,18 @@ def unique(jobs: Iterable[Job]) -> list[Job]:
 
 
 def fingerprint(config: Config) -> str:
-    """Ten letters that stand for all settings that a run can use, but the seed.
+    """Ten letters that stand for all settings that a run's results depend on, but the seed.
 
     Only what differs from the defaults counts, so a setting that a later version adds does not
-    give the same run another name. What the run cannot use counts as its method and preset have
-    it, whatever it is here: so it tells no runs apart, and those of before keep their names.
+    give the same run another name. What the run cannot use, or only tolerates
+    (`settings.TOLERANCE`), counts as its method and preset have it, whatever it is here: so it
+    tells no runs apart, and those of before keep their names.
     """
     names = {"method": config.method, "preset": config.preset, "seed": config.seed}
     usual = make_config(config.env, **names)
     plain = settings.flatten(settings.to_dict(Config(env=config.env, **names)))
-    changed = sorted(_lines(settings.relevant(config, usual)) - _lines(plain))
+    tolerating = settings.tolerating_as(config, usual)
+    changed = sorted(_lines(settings.relevant(tolerating, usual)) - _lines(plain))
     return hashlib.sha256("\n".join(changed).encode()).hexdigest()[:10]
 
 
