@@ -102,16 +102,16 @@ def diagnose(
     _check_heads(run)
     config = config_to_control(run.config(), settings or {})
     if collected:
-        return _examined(run, config, _collected(run, groups, num_episodes))
+        return examined(run, config, _collected(run, groups, num_episodes))
     kept = run.tests() if num_episodes is None else {}
     if kept:
         wanted = known_groups(groups, sim_param_sets(config).group_names)
         if kept.keys() >= set(wanted):
-            return _examined(run, config, {group: kept[group] for group in wanted})
+            return examined(run, config, {group: kept[group] for group in wanted})
     tested = run_tests(
         run_dir, groups=groups, num_episodes=num_episodes, settings=settings, progress=progress
     )
-    return _examined(run, tested.config, tested.trajectories)
+    return examined(run, tested.config, tested.trajectories)
 
 
 def _check_heads(run: RunDir) -> None:
@@ -133,9 +133,19 @@ def _collected(
     return {COLLECTED: run.iteration_data(run.finished_iterations - 1)}
 
 
-def _examined(
+def examined(
     run: RunDir, config: Config, trajectories: Mapping[str, list[Trajectory]]
 ) -> Diagnosis:
+    """Examine what a run's heads predict of some episodes, and how they are selected.
+
+    Args:
+        run: The run, of a method with prediction heads.
+        config: Its settings, with those of the planner perhaps changed.
+        trajectories: Episodes of its environment, by group.
+
+    Raises:
+        RunError: There is no trained run, or it is damaged.
+    """
     agent = load_agent(run, config)
     assert isinstance(agent, Agent)
     key = jax.random.key(config.evaluation.seed)
