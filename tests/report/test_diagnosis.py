@@ -1,7 +1,5 @@
 import json
-import runpy
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +9,6 @@ import headway
 from headway.cli import main
 from headway.errors import ConfigError, RunError, UnknownNameError
 from headway.report import diagnosis
-from headway.storage.records import read_csv
 from headway.storage.run_dir import RunDir
 
 SAMPLE = Path(__file__).parent.parent / "data" / "run-schema-2"  # two of three iterations
@@ -136,21 +133,3 @@ def test_damaged_tests_are_noticed(tested, tmp_path):
     damaged.write_bytes(content)
     with pytest.raises(RunError, match=r"tests/iteration-001\.safetensors is damaged"):
         headway.diagnose(path)
-
-
-def test_rules_of_selection_are_compared_on_the_same_episodes(tested, tmp_path, monkeypatch):
-    script = Path(__file__).parents[2] / "results" / "adaptation" / "selection.py"
-    table = tmp_path / "selection.csv"
-    monkeypatch.syspath_prepend(str(script.parent))
-    monkeypatch.delitem(sys.modules, "measure", raising=False)
-    rules = ["last 10", "random", "last layer; corrected heads, last 10"]
-    words = ["selection.py", str(tested), "--table", str(table), "--rules", *rules]
-    monkeypatch.setattr(sys, "argv", words)
-    found = runpy.run_path(str(script), run_name="__main__")
-    monkeypatch.delitem(sys.modules, "measure")  # results/planners has another one
-    rows = read_csv(table, found["COLUMNS"])
-    assert len(rows) == 3 * len(rules)
-    frozen = {row["average_error"] for row in rows if row["group"] == "low"}
-    errors = {row["rule"]: float(row["chosen_error"]) for row in rows if row["group"] == "low"}
-    assert len(frozen) == 2  # of frozen heads, and of those that learn
-    assert errors[rules[2]] < errors["last 10"] < errors["random"]

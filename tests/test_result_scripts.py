@@ -1,0 +1,70 @@
+"""The scripts behind `results/adaptation`: they run, go on where they were, and tell arms apart."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+import headway
+from headway.storage.records import read_csv
+
+SCRIPTS = Path(__file__).parents[1] / "results" / "adaptation"
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory):
+    path = tmp_path_factory.mktemp("trained") / "tmcl"
+    settings = {"evaluation.num_episodes": 2, "collection.episode_length": 45}
+    headway.train("pendulum", preset="smoke", run_dir=path, settings=settings)
+    return path
+
+
+@pytest.fixture
+def run_script(monkeypatch):
+    """Call a script as from the command line; returns its names."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+
+    def run(name, *words):
+        monkeypatch.delitem(sys.modules, "measure", raising=False)  # there are several
+        monkeypatch.setattr(sys, "argv", [name, *map(str, words)])
+        return runpy.run_path(str(SCRIPTS / name), run_name="__main__")
+
+    yield run
+    sys.modules.pop("measure", None)
+
+
+def test_rules_of_selection_are_compared_on_the_same_episodes(run_dir, run_script, tmp_path):
+    table = tmp_path / "selection.csv"
+    rules = ["last 10", "random", "last layer; corrected heads, last 10"]
+    found = run_script("selection.py", run_dir, "--table", table, "--rules", *rules)
+    rows = read_csv(table, found["COLUMNS"])
+    assert len(rows) == 3 * len(rules)
+    low = [row for row in rows if row["group"] == "low"]
+    assert len({row["average_error"] for row in low}) == 2  # frozen heads, and those that learn
+    errors = {row["rule"]: float(row["chosen_error"]) for row in low}
+    assert errors[rules[2]] < errors["last 10"]
+
+
+def test_arms_and_changes_of_physics(run_dir, run_script, tmp_path, capsys):
+    words = [run_dir, "--folder", tmp_path, "--arms", "none", "last-layer", "--step", 20]
+    found = run_script("changes.py", *words)
+    rows = read_csv(tmp_path / "tmcl.csv", found["COLUMNS"])
+    changes = found["CHANGES"]["pendulum"]
+    assert [row["arm"] for row in rows] == len(changes) * ["none"] + len(changes) * ["last-layer"]
+    frozen, learning = ([row["return_after"] for row in rows if row["arm"] == arm]
+                        for arm in ("none", "last-layer"))  # fmt: skip
+    assert frozen != learning
+    assert all(0 <= float(row["recovery_steps"]) <= 25 for row in rows)
+    capsys.readouterr()
+    run_script("changes.py", *words)
+    assert capsys.readouterr().out == ""  # nothing was missing
+
+
+def test_recovery_of_a_pendulum(run_script, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["changes.py"])
+    recovery_steps = runpy.run_path(str(SCRIPTS / "changes.py"))["recovery_steps"]
+    reward = [0.0] * 50 + [-8.0] * 30 + [-0.1] * 70
+    assert recovery_steps("pendulum", reward, 50) == 29  # one bad step of 20 is let pass
+    assert recovery_steps("pendulum", reward[:90], 50) == 40
+    assert recovery_steps("half-cheetah", [2.0] * 50 + [0.0] * 5 + [2.0] * 60, 50) == 3
