@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from summarise import last_rows, mean_by_physics
+from summarise import of_run
 
 Scores = dict[bool, list[float]]
 """One score per seed, over training (False) and over unseen physics (True)."""
@@ -15,7 +15,7 @@ Scores = dict[bool, list[float]]
 
 def scores_of(method: Path) -> Scores:
     """Mean score of each seed; every physics counts once."""
-    runs = [mean_by_physics(last_rows(seed)) for seed in sorted(method.glob("seed-*"))]
+    runs = [of_run(seed) for seed in sorted(method.glob("seed-*"))]
     return {
         unseen: [np.mean([s for (u, _), (_, s) in run.items() if u == unseen]) for run in runs]
         for unseen in (False, True)

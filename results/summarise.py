@@ -9,9 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from headway.experiment.references import score
+from headway.config import Config
+from headway.experiment.references import score_of
 from headway.storage.records import read_csv
+from headway.storage.run_dir import RunDir
 from headway.storage.tables import EVALUATION_COLUMNS, EpisodeRow, format_sim_params
+
+Means = dict[tuple[bool, str], tuple[float, float]]
+"""Return and score by physics, which is unseen or not."""
 
 
 def last_rows(run_dir: Path) -> list[EpisodeRow]:
@@ -22,19 +27,24 @@ def last_rows(run_dir: Path) -> list[EpisodeRow]:
     return [row for row in rows if row.iteration == last]
 
 
-def mean_by_physics(rows: list[EpisodeRow]) -> dict[tuple[bool, str], tuple[float, float]]:
+def mean_by_physics(rows: list[EpisodeRow], config: Config) -> Means:
     """Mean return and mean score (NaN where unknown) of each physics."""
     found = defaultdict(list)
     for row in rows:
-        value = score(row.env, row.sim_params, row.episode_return, row.length)
+        value = score_of(row, config)
         place = row.group != "train", format_sim_params(row.sim_params)
         found[place].append((row.episode_return, np.nan if value is None else value))
     return {place: tuple(np.mean(values, axis=0)) for place, values in found.items()}
 
 
+def of_run(run_dir: Path) -> Means:
+    """`mean_by_physics` of a run's last tests."""
+    return mean_by_physics(last_rows(run_dir), RunDir(run_dir).config())
+
+
 def main(run_dirs: list[str]) -> None:
     """Print one line per physics, then the means over training and unseen physics."""
-    runs = [mean_by_physics(last_rows(Path(run_dir))) for run_dir in run_dirs]
+    runs = [of_run(Path(run_dir)) for run_dir in run_dirs]
     print("physics | return of each run | score of each run | mean score")
     for place in sorted(runs[0]):
         returns, scores = zip(*(run[place] for run in runs), strict=True)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import headway
+from headway.config import Config
 from headway.experiment.progress import make_progress
 from headway.report.tables import by_physics
 from headway.settings import override
@@ -60,7 +61,7 @@ def measure(
         "seed": found.config.seed,
         "seconds_per_step": found.cost.seconds_per_step,
     }
-    return [shared | part for part in rows_of(found)]
+    return [shared | part for part in rows_of(found, found.config)]
 
 
 def tested_in_training(run_dir: Path) -> list[dict[str, Any]]:
@@ -68,17 +69,17 @@ def tested_in_training(run_dir: Path) -> list[dict[str, Any]]:
     table = [
         EpisodeRow.from_csv(r) for r in read_csv(run_dir / "evaluation.csv", EVALUATION_COLUMNS)
     ]
-    last = max(row.iteration for row in table)
+    table_end = [row for row in table if row.iteration == max(r.iteration for r in table)]
     config = RunDir(run_dir).config()
     shared = {"env": config.env, "method": config.method, "seed": config.seed}
     shared["seconds_per_step"] = ""
-    return [shared | part for part in rows_of([row for row in table if row.iteration == last])]
+    return [shared | part for part in rows_of(table_end, config)]
 
 
-def rows_of(episodes: Sequence[EpisodeRow]) -> list[dict[str, Any]]:
+def rows_of(episodes: Sequence[EpisodeRow], config: Config) -> list[dict[str, Any]]:
     """One row per physics."""
     rows = []
-    for part in by_physics(episodes):
+    for part in by_physics(episodes, config):
         score = "" if part["score"] is None else part["score"]
         kept = {name: part[name] for name in ("group", "episodes", "return_mean", "return_std")}
         rows.append({**kept, "score": score, "sim_params": json.dumps(part["sim_params"])})

@@ -106,7 +106,7 @@ def measure(run_dir: Path, settings: Settings, groups: list[str]) -> Settings:
     found = headway.evaluate(
         run_dir, groups=groups, settings=settings, progress=make_progress(quiet=True)
     )
-    parts = by_physics(found)
+    parts = by_physics(found, found.config)
     scores = [part["score"] for part in parts]
     return {
         "env": found.config.env,

@@ -230,19 +230,19 @@ def test_help_shows_the_defaults_of_the_preset(capsys):
 
 
 def test_train_prints_a_table_the_figures_and_what_to_do_next(capsys, calls, tmp_path):
-    words = ("train", "pendulum", "--preset", "smoke", "--seed", "3", "--quiet")
+    words = ("train", "pendulum", "--preset", "quick", "--seed", "3", "--quiet")
     code, out, err = run(capsys, *words)
     assert (code, err) == (0, "")
     for text in ("training", "length 0.5 m", "-1,091.0 ± 50.0", "1.00", str(tmp_path / "a.png")):
         assert text in out
     assert f"headway evaluate {tmp_path / 'run'}" in out
-    assert "headway train pendulum --preset smoke --seed 3 --quiet" in out
+    assert "headway train pendulum --preset quick --seed 3 --quiet" in out
     assert calls[0]["seed"] == 3
     assert calls[0]["run_dir"] is None
 
 
 def test_train_json_is_one_line(capsys, calls, tmp_path):
-    code, out, _ = run(capsys, "train", "pendulum", "--json", "--preset", "smoke")
+    code, out, _ = run(capsys, "train", "pendulum", "--json", "--preset", "quick")
     assert code == 0
     assert out.count("\n") == 1
     facts = json.loads(out)

@@ -6,6 +6,7 @@ import pytest
 from PIL import Image
 
 from headway.errors import RunError
+from headway.experiment.methods import make_config
 from headway.report.dynamics import Changes, choose_views, collect_changes
 from headway.report.figures import save_run_figures
 from headway.report.obs_names import obs_names
@@ -91,11 +92,27 @@ def test_a_group_score_counts_each_physics_once():
         physics = {"length": length, "mass": 1.0}
         return EpisodeRow("tmcl", "pendulum", 0, 0, "train", physics, 0, value, 200)
 
+    config = make_config("pendulum")
     rows = [row(0.5, -126.0), row(1.0, -1143.0), row(1.0, -1143.0)]
-    assert [part["episodes"] for part in by_physics(rows)] == [1, 2]
-    assert by_group(rows)[0]["score"] == pytest.approx(0.5)
+    assert [part["episodes"] for part in by_physics(rows, config)] == [1, 2]
+    assert by_group(rows, config)[0]["score"] == pytest.approx(0.5)
     rows.append(row(9.0, 0.0))
-    assert by_group(rows)[0]["score"] is None
+    assert by_group(rows, config)[0]["score"] is None
+
+
+def test_scores_are_of_the_protocol_not_of_the_episodes_that_survived():
+    def row(value, steps):
+        physics = {"mass_scale": 0.1}
+        return EpisodeRow("tmcl", "cartpole-swingup", 0, 0, "low", physics, 0, value, steps)
+
+    rows = [row(480.0, 500), *[row(20.0, 60)] * 9]
+    whole = make_config("cartpole-swingup")
+    assert by_physics(rows, whole)[0]["score"] == pytest.approx((66 - 215) / (489 - 215))
+    assert by_physics([row(80.0, 200)], whole)[0]["score"] == pytest.approx(-135 / 274)
+    options = {"env_options": {"terminate_off_track": True}}
+    ending = make_config("cartpole-swingup", settings=options)
+    assert by_physics(rows, ending)[0]["score"] is None  # nothing was measured for it
+    assert by_group(rows, ending)[0]["score"] is None
 
 
 def test_the_views_are_the_numbers_that_tell_physics_apart():

@@ -43,7 +43,7 @@ def train(words: Sequence[str]) -> int:
     config, seeds = runs[0].config, ", ".join(str(run.config.seed) for run in runs)
     title = f"{config.env}, {config.method} after {len(runs[0].metrics)} iterations"
     rows = [row for run in runs for row in _last_rows(run)]
-    _print_evaluation(rows, f"{title}, seeds {seeds}" if arguments.seeds else title)
+    _print_evaluation(rows, config, f"{title}, seeds {seeds}" if arguments.seeds else title)
     again = "The command, which resumes what was interrupted"
     for heading, lines in (
         ("Figures", [str(path) for run in runs for path in run.figures]),
@@ -89,7 +89,7 @@ def _facts(run: "Run") -> dict[str, Any]:
         "seed": run.config.seed,
         "iterations": len(run.metrics),
         "timesteps": run.metrics[-1]["timesteps"],
-        **_results(_last_rows(run)),
+        **_results(_last_rows(run), run.config),
         "figures": [str(path) for path in run.figures],
     }
 
@@ -110,8 +110,8 @@ def evaluate(words: Sequence[str]) -> int:
     if arguments.json:
         cost = dataclasses.asdict(found.cost)
         facts = {"run_dir": str(arguments.run), "settings": settings, "planning": cost}
-        return _print_json({**facts, **_results(found)})
-    _print_evaluation(found, f"{arguments.run}")
+        return _print_json({**facts, **_results(found, found.config)})
+    _print_evaluation(found, found.config, f"{arguments.run}")
     _print_cost(found.cost)
     return 0
 
@@ -214,16 +214,16 @@ def _read_sim_params(path: Path) -> dict[str, Any]:
         ) from None
 
 
-def _results(rows: "Sequence[EpisodeRow]") -> dict[str, Any]:
+def _results(rows: "Sequence[EpisodeRow]", config: Config) -> dict[str, Any]:
     from headway.report.tables import by_group, by_physics
 
-    return {"groups": by_group(rows), "physics": by_physics(rows)}
+    return {"groups": by_group(rows, config), "physics": by_physics(rows, config)}
 
 
-def _print_evaluation(rows: "Sequence[EpisodeRow]", title: str) -> None:
+def _print_evaluation(rows: "Sequence[EpisodeRow]", config: Config, title: str) -> None:
     from headway.report.tables import evaluation
 
-    _print_tables(evaluation(rows, title))
+    _print_tables(evaluation(rows, config, title))
 
 
 def _print_cost(cost: "PlanningCost") -> None:

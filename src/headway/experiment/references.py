@@ -8,9 +8,12 @@ episodes per value. CartPoleSwingUp's ceiling is no upper bound for heavy poles.
 (results/ceilings).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
+from headway.config import Config
 from headway.errors import ConfigError
+from headway.storage.tables import EpisodeRow
+from headway.tasks.catalog import env_options, env_spec, episode_length
 
 _PENDULUM = {  # length: (random, ceiling), 200 steps
     0.25: (-1748.0, -539.0),
@@ -54,17 +57,40 @@ _TABLES = {  # by environment and steps of an episode: what varies, and the retu
     ("cartpole-swingup", 200): ("mass_scale", _SHORT_CARTPOLE_SWINGUP),
 }
 
+_MEASURED = {env for env, _ in _TABLES}
+
+
+def score_of(row: EpisodeRow, config: Config) -> float | None:
+    """Score of one test episode; None where no reference was measured with the run's protocol.
+
+    Options of the environment that differ from the defaults make it another one. An episode that
+    ended early counts with what it earned.
+
+    Args:
+        row: The episode.
+        config: Settings of the run that was tested.
+    """
+    if config.env not in _MEASURED or env_options(config) != env_spec(config.env).options:
+        return None
+    return score(config.env, row.sim_params, row.episode_return, episode_length(config))
+
+
+def mean_score(scores: Sequence[float | None]) -> float | None:
+    """The mean, or None where one is unknown: what is known may not stand for the rest."""
+    known = [value for value in scores if value is not None]
+    return sum(known) / len(known) if known and len(known) == len(scores) else None
+
 
 def score(
     env: str, sim_params: Mapping[str, float], episode_return: float, length: int
 ) -> float | None:
-    """Normalise the return of one full episode: 0 is random, 1 the true dynamics.
+    """Normalise a return: 0 is random, 1 the paper's planner on the true dynamics.
 
     Args:
         env: Short name of the environment.
         sim_params: The episode's simulator parameters.
         episode_return: Sum of rewards.
-        length: Steps of the episode.
+        length: Steps of an episode, if it does not end early.
 
     Returns:
         The score, or None where no reference is known for these physics and this length.

@@ -10,7 +10,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from headway.config import Config
-from headway.experiment.references import score
+from headway.experiment.references import score_of
 from headway.report.physics import axis_label, distinct, value_label, varying
 from headway.report.style import (
     FAINT,
@@ -198,7 +198,7 @@ def evaluation(run: RunDir, config: Config) -> Path | None:
     path = run.figures / "evaluation.png"
     returns = [row.episode_return for row in rows]
     panels: list[tuple[str, Sequence[float | None]]] = [("return per episode", returns)]
-    scores = [score(r.env, r.sim_params, r.episode_return, r.length) for r in rows]
+    scores = [score_of(row, config) for row in rows]
     if any(value is not None for value in scores):
         panels.append(("score (0 random, 1 true dynamics)", scores))
     caption = (

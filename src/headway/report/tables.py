@@ -7,8 +7,9 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
+from headway.config import Config
 from headway.experiment.methods import METHODS, PRESETS
-from headway.experiment.references import score
+from headway.experiment.references import mean_score, score_of
 from headway.report.physics import axis_label, distinct, full_label, value_label, varying
 from headway.storage.tables import EpisodeRow
 from headway.tasks.catalog import EnvSpec, env_names, env_spec
@@ -16,8 +17,12 @@ from headway.tasks.catalog import EnvSpec, env_names, env_spec
 Facts = dict[str, Any]
 
 
-def by_physics(rows: Sequence[EpisodeRow]) -> list[Facts]:
+def by_physics(rows: Sequence[EpisodeRow], config: Config) -> list[Facts]:
     """Summarise test episodes for each group and its simulator parameters.
+
+    Args:
+        rows: Test episodes.
+        config: Settings of the run, or runs, that were tested.
 
     Returns:
         Group, simulator parameters, number of episodes, mean and standard deviation of the
@@ -27,39 +32,37 @@ def by_physics(rows: Sequence[EpisodeRow]) -> list[Facts]:
     for group in dict.fromkeys(row.group for row in rows):
         for sim_params in distinct(row.sim_params for row in rows if row.group == group):
             same = [r for r in rows if r.group == group and dict(r.sim_params) == sim_params]
-            scores = [score(r.env, r.sim_params, r.episode_return, r.length) for r in same]
-            known = [value for value in scores if value is not None]
             facts.append(
                 {
                     "group": group,
                     "sim_params": sim_params,
                     **_returns(same),
-                    "score": float(np.mean(known)) if known else None,
+                    "score": mean_score([score_of(row, config) for row in same]),
                 }
             )
     return facts
 
 
-def by_group(rows: Sequence[EpisodeRow]) -> list[Facts]:
+def by_group(rows: Sequence[EpisodeRow], config: Config) -> list[Facts]:
     """Summarise test episodes for each group.
 
     A group's score is the mean over its physics, each counting once; it is None unless a
     reference is known for every one of them.
     """
-    parts = by_physics(rows)
+    parts = by_physics(rows, config)
     facts = []
     for group in dict.fromkeys(row.group for row in rows):
         scores = [part["score"] for part in parts if part["group"] == group]
-        whole = None if None in scores else float(np.mean(scores))
+        whole = mean_score(scores)
         facts.append(
             {"group": group, **_returns([r for r in rows if r.group == group]), "score": whole}
         )
     return facts
 
 
-def evaluation(rows: Sequence[EpisodeRow], title: str) -> Table:
+def evaluation(rows: Sequence[EpisodeRow], config: Config, title: str) -> Table:
     """Lay out the returns of test episodes: a line per group, then one per physics."""
-    parts, groups = by_physics(rows), by_group(rows)
+    parts, groups = by_physics(rows, config), by_group(rows, config)
     with_score = any(part["score"] is not None for part in parts)
     table = new_table(title, "physics")
     for name in ("episodes", "return", *["score"] * with_score):
@@ -75,7 +78,7 @@ def evaluation(rows: Sequence[EpisodeRow], title: str) -> Table:
                 table.add_row(physics, *_cells(part, with_score))
         table.add_section()
     if with_score:
-        table.caption = "score: 0 = random actions, 1 = the planner on the true dynamics"
+        table.caption = "score: 0 = random actions, 1 = the paper's planner on the true dynamics"
     else:
         table.caption = "return: mean ± standard deviation over episodes"
     return table

@@ -84,7 +84,7 @@ def _training_and_score(found: Found, env: str, arm: str) -> list[str]:
         if (cell.env, cell.arm) != (env, arm) or cell in found.missing:
             continue
         last = [r for r in RunDir(job.path).evaluation() if r.iteration == job.num_iterations - 1]
-        groups = by_group(last)
+        groups = by_group(last, job.config)
         training += [g["return_mean"] for g in groups if g["group"] == "train"]
         unseen = [g["score"] for g in groups if g["group"] != "train"]
         scores += [] if None in unseen or not unseen else [float(np.mean(unseen))]
@@ -98,8 +98,8 @@ def _about(found: Found) -> list[str]:
     lines = [
         f"Preset `{comparison.preset}`{changed}, seeds {seeds}. Mean ± standard deviation over"
         " seeds after the last iteration; interquartile mean with its 95 % stratified bootstrap"
-        " interval. The score is that on unseen physics: 0 is random, 1 the planner on the true"
-        " dynamics.",
+        " interval. The score is that on unseen physics: 0 is random, 1 the paper's planner on the"
+        " true dynamics.",
     ]
     if len(comparison.seeds) < MIN_RUNS:
         lines.append(f"Fewer than {MIN_RUNS} seeds: no difference between arms can be claimed.")

@@ -158,7 +158,7 @@ def _raw(comparison: Comparison, run: LoadedRun, label: str) -> list[Row]:
     for group in dict.fromkeys(row.group for row in run.tests):
         for physics, same in by_physics([r for r in run.tests if r.group == group]).items():
             returns = np.array([row.episode_return for row in same])
-            score = outcome(same, comparison.references).score
+            score = outcome(same, comparison.references, run.config).score
             rows.append(
                 {
                     "env": run.config.env,

@@ -5,15 +5,17 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from headway.experiment.references import normalised, score
+from headway.config import Config
+from headway.experiment.references import mean_score, normalised, score_of
 from headway.report.page.runs import LoadedRun
 from headway.storage.tables import EpisodeRow, format_sim_params
+from headway.tasks.catalog import env_names, env_options, episode_length
 
 RANDOM = "random"
 CEILING = "true-dynamics"
 REFERENCES = (RANDOM, CEILING)
 
-_Place = tuple[str, str, int]  # environment, physics, steps of the episode
+_Place = tuple[str, str, int, str]  # environment, physics, steps of an episode, options
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,23 +41,25 @@ class References:
         found: dict[tuple[str, _Place], list[float]] = {}
         for run in runs:
             if run.config.method in REFERENCES:
-                for place, value in _by_place(run.tests).items():
+                for place, value in _by_place(run.tests, run.config).items():
                     found.setdefault((run.config.method, place), []).append(value)
         return cls({place: float(np.mean(values)) for place, values in found.items()})
 
-    def score(self, row: EpisodeRow) -> float | None:
-        """Score of one test episode; None where no reference is known.
+    def score(self, row: EpisodeRow, config: Config) -> float | None:
+        """Score of one test episode of a run; None where no reference is known.
 
         References among the runs come first, then the project's own table.
         """
-        random, ceiling = (self.returns.get((name, _place(row))) for name in REFERENCES)
+        random, ceiling = (self.returns.get((name, _place(row, config))) for name in REFERENCES)
         if random is None or ceiling is None or random == ceiling:
-            return score(row.env, row.sim_params, row.episode_return, row.length)
+            return score_of(row, config)
         return normalised(row.episode_return, random, ceiling)
 
-    def level(self, method: str, rows: Iterable[EpisodeRow]) -> float | None:
-        """Mean return of a reference over the places of some episodes; None if one lacks."""
-        return _mean([self.returns.get((method, place)) for place in {_place(row) for row in rows}])
+    def level(self, method: str, runs: Sequence[LoadedRun], group: str) -> float | None:
+        """Mean return of a reference over the physics of a group; None if one lacks."""
+        tests = [(row, run.config) for run in runs for row in run.tests if row.group == group]
+        places = {_place(row, config) for row, config in tests}
+        return mean_score([self.returns.get((method, place)) for place in places])
 
     def describe(self, env: str) -> str:
         """Say where the references of an environment come from."""
@@ -65,18 +69,12 @@ class References:
         return "normalised by the project's reference returns"
 
 
-def outcome(rows: Sequence[EpisodeRow], references: References) -> Outcome:
+def outcome(rows: Sequence[EpisodeRow], references: References, config: Config) -> Outcome:
     """Summarise one run's test episodes of one group."""
     parts = by_physics(rows).values()
     returns = [np.mean([row.episode_return for row in same]) for same in parts]
-    scores = [_mean([references.score(row) for row in same]) for same in parts]
-    return Outcome(float(np.mean(returns)), _mean(scores))
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    """The mean, or None where one value is missing."""
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known and len(known) == len(values) else None
+    scores = [mean_score([references.score(row, config) for row in same]) for same in parts]
+    return Outcome(float(np.mean(returns)), mean_score(scores))
 
 
 def by_physics(rows: Sequence[EpisodeRow]) -> dict[str, list[EpisodeRow]]:
@@ -87,12 +85,15 @@ def by_physics(rows: Sequence[EpisodeRow]) -> dict[str, list[EpisodeRow]]:
     return found
 
 
-def _by_place(rows: Iterable[EpisodeRow]) -> dict[_Place, float]:
+def _by_place(rows: Iterable[EpisodeRow], config: Config) -> dict[_Place, float]:
     found: dict[_Place, list[float]] = {}
     for row in rows:
-        found.setdefault(_place(row), []).append(row.episode_return)
+        found.setdefault(_place(row, config), []).append(row.episode_return)
     return {place: float(np.mean(values)) for place, values in found.items()}
 
 
-def _place(row: EpisodeRow) -> _Place:
-    return row.env, format_sim_params(row.sim_params), row.length
+def _place(row: EpisodeRow, config: Config) -> _Place:
+    physics, known = format_sim_params(row.sim_params), config.env in env_names()
+    length = episode_length(config) if known else config.collection.episode_length
+    options = env_options(config) if known else config.env_options
+    return config.env, physics, length or 0, repr(sorted(options.items()))

@@ -141,8 +141,8 @@ def _curves(comparison: Comparison, env: str, group: str) -> Panel | None:
     ]
     if not any(len(measured.steps) > 1 for _, measured in found):
         return None
-    rows = [row for run in comparison.runs_of(env) for row in run.tests if row.group == group]
-    known = {name: comparison.references.level(name, rows) for name in REFERENCES}
+    runs, references = comparison.runs_of(env), comparison.references
+    known = {name: references.level(name, runs, group) for name in REFERENCES}
     levels = {name: level for name, level in known.items() if level is not None}
     title = charts.group_title(group)
     drawn = svg.panel(

@@ -79,7 +79,7 @@ class Comparison:
                 for group in dict.fromkeys(row.group for row in run.tests):
                     rows = [row for row in run.tests if row.group == group]
                     places = found.setdefault((env, label, group), [])
-                    places.append(outcome(rows, self.references))
+                    places.append(outcome(rows, self.references, run.config))
         return found
 
     @functools.cached_property
