@@ -14,6 +14,7 @@ from headway.config import (
     PlannerConfig,
 )
 from headway.errors import ConfigError
+from headway.experiment.methods import config_to_evaluate, make_config
 from headway.settings import (
     TOLERANCE,
     differences,
@@ -238,6 +239,32 @@ def test_settings_that_contradict_each_other_are_refused():
         PlannerConfig(selection_skips_newest=True, selection_length=1)
     with pytest.raises(ConfigError, match=r"num_particles is 7, allowed: a multiple of.*\(5\)"):
         Config(env="hopper", planner=PlannerConfig(num_particles=7))
+
+
+def test_what_a_model_has_no_use_for_is_refused():
+    with pytest.raises(ConfigError, match="selection_error is 'corrected' where no head learns"):
+        make_config("pendulum", settings={"planner.selection_error": "corrected"})
+    with pytest.raises(ConfigError, match="'context': 'sim-params'"):
+        make_config("pendulum", method="rebal", settings={"model.context": "sim-params"})
+
+
+@pytest.mark.parametrize(
+    ("method", "settings", "refused"),
+    [
+        ("grbal", {"planner.adaptation": "last-layer"}, "planner.adaptation"),
+        ("tmcl", {"planner.forgetting": 0.1}, "planner.forgetting"),
+        ("tmcl", {"planner.temperature": 0.7}, "planner.temperature"),
+        ("tmcl", {"planner.temperature": 0.7, "planner.optimizer": "mppi"}, None),
+        ("tmcl", {"planner.forgetting": 0.0, "planner.horizon": 3}, None),
+    ],
+)
+def test_a_test_with_settings_that_change_nothing_is_refused(method, settings, refused):
+    config = make_config("pendulum", method=method)
+    if refused is None:
+        assert config_to_evaluate(config, settings) == override(config, settings)
+    else:
+        with pytest.raises(ConfigError, match=f"{refused} would change nothing for {method}"):
+            config_to_evaluate(config, settings)
 
 
 def test_what_concerns_the_whole_is_named_without_a_section():

@@ -61,10 +61,12 @@ def test_arms_and_changes_of_physics(run_dir, run_script, tmp_path, capsys):
     assert capsys.readouterr().out == ""  # nothing was missing
 
 
-def test_recovery_of_a_pendulum(run_script, tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["changes.py"])
+def test_recovery_of_a_pendulum(monkeypatch):
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    monkeypatch.delitem(sys.modules, "measure", raising=False)
     recovery_steps = runpy.run_path(str(SCRIPTS / "changes.py"))["recovery_steps"]
     reward = [0.0] * 50 + [-8.0] * 30 + [-0.1] * 70
+    sys.modules.pop("measure")
     assert recovery_steps("pendulum", reward, 50) == 29  # one bad step of 20 is let pass
     assert recovery_steps("pendulum", reward[:90], 50) == 40
     assert recovery_steps("half-cheetah", [2.0] * 50 + [0.0] * 5 + [2.0] * 60, 50) == 3

@@ -41,7 +41,8 @@ def planners(own: PlannerConfig, num_members: int) -> dict[str, Settings]:
     """
     paper = size_of(PlannerConfig())
     fast = {"num_candidates": 100, "num_elites": 20, "num_iterations": 3}
-    half_iterations = {"num_iterations": (own.num_iterations + 1) // 2}
+    some = (own.num_iterations + 1) // 2
+    fewer_iterations = {"num_iterations": some}
     warm = {"warm_variance": True}
     return {
         "cem": {},
@@ -49,10 +50,10 @@ def planners(own: PlannerConfig, num_members: int) -> dict[str, Settings]:
         "paper, fast": paper | fast | {"num_particles": num_members},
         "cem, 1/2 of the candidates": fewer(own, 2),
         "cem, 1/4 of the candidates": fewer(own, 4),
-        "cem, half the iterations": half_iterations,
+        f"cem, {some} iterations": fewer_iterations,
         "cem, a particle per member": {"num_particles": num_members},
         "cem, warm": warm,
-        "cem, warm, half the iterations": warm | half_iterations,
+        f"cem, warm, {some} iterations": warm | fewer_iterations,
         "cem, warm, 1/4 of the candidates": warm | fewer(own, 4),
         "cem, settle 0.05": {"settle_tolerance": 0.05},
         "cem, settle 0.08": {"settle_tolerance": 0.08},
@@ -60,9 +61,9 @@ def planners(own: PlannerConfig, num_members: int) -> dict[str, Settings]:
         "icem": icem(own, 1),
         "icem, 1/2 of the candidates": icem(own, 2),
         "icem, 1/4 of the candidates": icem(own, 4),
-        "mppi": {"optimizer": "mppi"},
-        "mppi, 1/2 of the candidates": {"optimizer": "mppi"} | fewer(own, 2),
-        "mppi, 1/4 of the candidates": {"optimizer": "mppi"} | fewer(own, 4),
+        "mppi": mppi(own, 1),
+        "mppi, 1/2 of the candidates": mppi(own, 2),
+        "mppi, 1/4 of the candidates": mppi(own, 4),
         "random-shooting": {"optimizer": "random-shooting"},
     }
 
@@ -86,6 +87,11 @@ def icem(own: PlannerConfig, share: int) -> Settings:
     num_candidates = max(own.num_candidates // share, 4)
     num_elites = max(num_candidates // 10, 2)
     return {"optimizer": "icem", "num_candidates": num_candidates, "num_elites": num_elites}
+
+
+def mppi(own: PlannerConfig, share: int) -> Settings:
+    """A share of the candidates."""
+    return {"optimizer": "mppi", "num_candidates": max(own.num_candidates // share, 1)}
 
 
 def distinct(config: Config) -> dict[str, Settings]:

@@ -80,6 +80,37 @@ class SimParamSets:
         combinations = itertools.product(*values.values())
         return [dict(zip(values, map(float, chosen), strict=True)) for chosen in combinations]
 
+    def spread(self, name: str, count: int) -> list[dict[str, float]]:
+        """Return so many physics of a group, with every value of a parameter equally often.
+
+        All combinations in turn if there are not more than `count`. Else a Latin hypercube:
+        each parameter goes evenly through its values, in an order of its own that is always the
+        same.
+
+        Args:
+            name: `"train"` or an unseen group.
+            count: How many.
+
+        Raises:
+            UnknownNameError: There is no such group.
+        """
+        combinations = self.group(name)
+        if count >= len(combinations):
+            return [combinations[i % len(combinations)] for i in range(count)]
+        values = self.train if name == "train" else self.unseen[name]
+        rng = np.random.default_rng(0)
+        columns = {
+            parameter: rng.permutation(np.arange(count) * len(numbers) // count)
+            for parameter, numbers in values.items()
+        }
+        return [
+            {
+                parameter: float(values[parameter][places[i]])
+                for parameter, places in columns.items()
+            }
+            for i in range(count)
+        ]
+
     def to_dict(self) -> dict[str, Any]:
         """Return plain dictionaries and lists, ready for JSON."""
         return {

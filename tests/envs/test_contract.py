@@ -198,6 +198,21 @@ def test_a_simulation_that_diverges_is_told(tmp_path, monkeypatch):
         env.step(env.action_space.sample())
 
 
+def test_a_good_state_ends_the_trouble_of_a_bad_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    env, other = envs.make("hopper"), envs.make("hopper")
+    for one in (env, other):
+        one.reset(seed=0)
+    good, action = env.unwrapped.get_state(), env.action_space.sample()
+    bad = good.copy()
+    bad[6:12] = 1e12
+    env.unwrapped.set_state(bad)
+    with pytest.raises(BrokenEpisodeError):
+        env.step(action)
+    env.unwrapped.set_state(good)
+    np.testing.assert_array_equal(env.step(action)[0], other.step(action)[0])
+
+
 def test_leaving_the_track_ends_the_episode_if_asked_for():
     for ends in (False, True):
         env = envs.make("cartpole-swingup", terminate_off_track=ends)

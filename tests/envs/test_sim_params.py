@@ -56,3 +56,16 @@ def test_bad_sets_are_refused_in_one_line(values):
     with pytest.raises(ConfigError) as caught:
         SimParamSets.from_dict(values)
     assert "\n" not in str(caught.value)
+
+
+def test_a_part_of_a_grid_has_every_value_equally_often():
+    values = (0.5, 0.75, 1.0, 1.25, 1.5)
+    sets = SimParamSets({"mass": values, "damping": values, "gravity": (1.0,)})
+    found = sets.spread("train", 10)
+    for name in ("mass", "damping"):
+        assert [sum(physics[name] == value for physics in found) for value in values] == [2] * 5
+    assert len({tuple(physics.items()) for physics in found}) >= 8  # no diagonal
+    assert found == sets.spread("train", 10)
+    assert sets.spread("train", 30) == [*sets.group("train"), *sets.group("train")[:5]]
+    one = SimParamSets({"mass": (1.0, 2.0, 3.0, 4.0)}).spread("train", 2)
+    assert sorted(physics["mass"] for physics in one) == [1.0, 3.0]

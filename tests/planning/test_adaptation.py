@@ -297,12 +297,17 @@ def test_nothing_is_remembered_where_nothing_keeps_learning():
     assert jax.tree.leaves(Learned.nothing(agent, 2)) == []
 
 
-def test_the_variance_in_the_plan_is_that_of_the_regression():
-    """Against φᵀPφ with φ computed by the network itself."""
-    agent = make_agent(toys.small_model(), adaptation_variance=True)
+@pytest.mark.parametrize("choices", [[0], [1], [0, 1]])
+@pytest.mark.parametrize("own", ["constant", "heads"])
+def test_the_variance_in_the_plan_is_that_of_the_regression(choices, own):
+    """Against φᵀPφ with φ computed by the network itself; averaged heads are independent."""
+    agent = make_agent(toys.small_model(), adaptation_variance=True, adaptation_noise=own)
     state, _ = play(agent, 1.0, 4)
     layer, context = state.learned.layer, encode(agent, state.recent)
-    heads = jnp.zeros((2, 2, 1), int)
+    layer = layer._replace(
+        root=layer.root * jnp.asarray([1.0, 3.0])[: layer.root.shape[2], None, None]
+    )
+    heads = jnp.broadcast_to(jnp.asarray(choices), (2, 2, len(choices)))
     folded = ImaginedDynamics.fold(
         agent.model,
         agent.statistics,
@@ -319,14 +324,15 @@ def test_the_variance_in_the_plan_is_that_of_the_regression():
         noise = jnp.ones((2, 2, 1, 5))
         std = np.asarray(one.sample_delta(x, noise) - one.sample_delta(x, None))[:, :, 0]
         plain = one.of_env(one.heads._replace(doubt=None))
-        own = np.asarray(plain.sample_delta(x, noise) - plain.sample_delta(x, None))[:, :, 0]
+        frozen = np.asarray(plain.sample_delta(x, noise) - plain.sample_delta(x, None))[:, :, 0]
         for member, row in np.ndindex(2, 5):
             rest = [*np.asarray(context)[member, env], 1.0]
             phi = np.concatenate([hidden[member, row], rest])
-            root = np.asarray(layer.root)[env, member, 0]
+            groups = [choice if own == "heads" else 0 for choice in choices]
+            roots = np.asarray(layer.root)[env, member][groups]
             scale = np.asarray(agent.prior.noise)[member]  # deltas are not scaled here
-            added = phi @ root @ root.T @ phi * scale
-            got = std[member, :, row] ** 2 - own[member, :, row] ** 2
+            added = np.square(phi @ roots).sum() / len(choices) ** 2 * scale
+            got = std[member, :, row] ** 2 - frozen[member, :, row] ** 2
             np.testing.assert_allclose(got, added, rtol=2e-3, atol=1e-5)
 
 

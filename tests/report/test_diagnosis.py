@@ -8,6 +8,7 @@ import pytest
 import headway
 from headway.cli import main
 from headway.errors import ConfigError, RunError, UnknownNameError
+from headway.experiment.methods import make_config
 from headway.report import diagnosis
 from headway.storage.run_dir import RunDir
 
@@ -70,6 +71,13 @@ def test_only_models_with_heads_are_diagnosed(tmp_path):
     run = headway.train("pendulum", method="random", preset="smoke", run_dir=tmp_path / "run")
     with pytest.raises(ConfigError, match="a run of random, which has no prediction heads"):
         headway.diagnose(run.path)
+
+
+@pytest.mark.parametrize("words", [[], ["--collected"]])
+def test_only_trained_runs_are_diagnosed(tmp_path, words, capsys):
+    RunDir(tmp_path / "run").create_or_resume(make_config("pendulum", preset="smoke"))
+    assert main(["diagnose", str(tmp_path / "run"), "--quiet", *words]) == 1
+    assert "has no finished iteration yet" in capsys.readouterr().err
 
 
 def test_only_runs_are_diagnosed(tmp_path, capsys):

@@ -15,6 +15,7 @@ ContextPlace = Literal["input", "last-hidden", "head"]
 PLAIN: Mapping[str, Any] = {
     "num_members": 1,
     "num_heads": 1,
+    "context": "learned",
     "context_size": 0,
     "backward_net": False,
     "deterministic": True,

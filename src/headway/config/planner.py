@@ -60,8 +60,8 @@ class PlannerConfig:
     `jax.distributed` joins, which must then all act alike, step by step."""
     head_selection: HeadSelection = "adaptive"
     """Which head plans: the best on recent transitions, their average, or a random one; the most
-    likely one given all transitions, of which those older than `selection_length` hardly count
-    (`evidence`), or one drawn by each member with that probability (`evidence-sampled`)."""
+    likely one given all transitions, of which older ones count less, 37 % after `selection_length`
+    steps (`evidence`), or one drawn by each member with that probability (`evidence-sampled`)."""
     selection_length: int = 10
     """Past transitions on which heads compete (N)."""
     selection_error: Literal["mean", "sampled", "corrected"] = "mean"
@@ -87,8 +87,8 @@ class PlannerConfig:
     """Share of the uncertainty before the episode that comes back at every step, so that old
     transitions count less; 0 never forgets (last-layer)."""
     change_threshold: float = 0.0
-    """Log Bayes factor for changed physics above which all that was learned is dropped; 0 never
-    does (last-layer)."""
+    """Log Bayes factor for changed physics above which the corrections are dropped; 0 never does
+    (last-layer)."""
     risk_aversion: float = 0.0
     """Candidates are ranked by the mean return minus this many standard deviations over their
     particles."""
@@ -118,6 +118,11 @@ class PlannerConfig:
         problems.one_of("adaptation_prior", ("owner", "runner-up"))
         problems.between(0.0, 0.99, "forgetting")
         problems.at_least(0, "change_threshold", "risk_aversion")
+        problems.require(
+            self.selection_error != "corrected" or self.adaptation == "last-layer",
+            "selection_error is 'corrected' where no head learns, allowed: mean or sampled, or"
+            " adaptation last-layer",
+        )
         share = {"icem": 2, "mppi": 0, "random-shooting": 0}.get(self.optimizer, 1)
         problems.require(
             share * self.num_elites <= self.num_candidates,

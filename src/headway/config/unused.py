@@ -78,6 +78,14 @@ def _is_recurrent(config: Config) -> bool:
     return config.model.kind == "recurrent"
 
 
+def _samples_futures(config: Config) -> bool:
+    return config.model.kind != "recurrent"
+
+
+def _selects_by_error(config: Config) -> bool:
+    return config.planner.head_selection not in ("evidence", "evidence-sampled")
+
+
 def _adapts_last_layer(config: Config) -> bool:
     return _is_multi_headed(config) and config.planner.adaptation == "last-layer"
 
@@ -124,6 +132,8 @@ _USED_WHEN: tuple[tuple[Callable[[Config], bool], tuple[str, ...]], ...] = (
     ),
     (_adapts_by_gradient, ("model.adaptation_length", "model.adaptation_rate")),
     (_is_recurrent, ("fitting.backprop_steps",)),
+    (_samples_futures, ("fitting.future_length",)),
+    (_selects_by_error, ("planner.selection_error", "planner.selection_skips_newest")),
     (
         _adapts_last_layer,
         (

@@ -71,6 +71,7 @@ class LocomotionEnv(WorldEnv):
         """
         nq, nv = self.model.nq, self.model.nv
         state = check_state(self._world.name, state, nq + 2 * nv + 1)
+        self.data.warning.number[:] = 0  # they are of where it was before
         parts = np.split(state, [nq, nq + nv, nq + 2 * nv])
         self.data.qpos[:], self.data.qvel[:], self.data.qacc_warmstart[:] = parts[:3]
         self._velocity = float(parts[3][0])

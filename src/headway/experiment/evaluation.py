@@ -68,9 +68,9 @@ def group_episodes(
     Raises:
         UnknownNameError: No such group.
     """
-    physics = sim_params.group(group)
+    physics = sim_params.spread(group, num_episodes)
     first = first_seed + GROUP_SEEDS * list(sim_params.group_names).index(group)
-    return [Episode(physics[i % len(physics)], first + i) for i in range(num_episodes)]
+    return [Episode(each, first + i) for i, each in enumerate(physics)]
 
 
 def evaluate_agent(

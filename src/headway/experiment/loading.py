@@ -44,6 +44,20 @@ def load_learned(run: RunDir, config: Config, *, ignore_limits: bool = False) ->
         LimitError: The model needs more memory than is free.
         RunError: No iteration is finished yet, or the checkpoint is damaged.
     """
+    finished = finished_iterations(run)
+    task = load_task(config)
+    if not ignore_limits:
+        check_memory(need_of(config).to_load)
+    template = eqx.filter_eval_shape(lambda: initial(config, task))
+    return arrays.load_tree(run.checked_checkpoint(finished - 1), template)
+
+
+def finished_iterations(run: RunDir) -> int:
+    """How many iterations of a run are finished; at least one.
+
+    Raises:
+        RunError: None is, or the run is damaged.
+    """
     finished = run.finished_iterations
     if finished == 0:
         run.check()  # finds checkpoints without their manifests
@@ -51,11 +65,7 @@ def load_learned(run: RunDir, config: Config, *, ignore_limits: bool = False) ->
             f"{run.path} has no finished iteration yet, because nothing is in manifests/; go on"
             " training it with the same `headway train` command, or complete the copy."
         )
-    task = load_task(config)
-    if not ignore_limits:
-        check_memory(need_of(config).to_load)
-    template = eqx.filter_eval_shape(lambda: initial(config, task))
-    return arrays.load_tree(run.checked_checkpoint(finished - 1), template)
+    return finished
 
 
 def load_agent(run: RunDir, config: Config | None = None, arena: Arena | None = None) -> Acting:

@@ -9,8 +9,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from headway.config import PLAIN, Config
+from headway.config.unused import unused_settings
 from headway.errors import ConfigError, unknown_name
-from headway.settings import TOLERANCE, override, setting_names
+from headway.settings import TOLERANCE, flatten, override, setting_names, to_dict
 from headway.tasks.catalog import EnvSpec, env_spec, episode_length, sim_param_sets
 
 Settings = Mapping[str, Any]
@@ -328,8 +329,8 @@ def config_to_evaluate(config: Config, settings: Settings) -> Config:
             what is done about environments that break (`settings.TOLERANCE`).
 
     Raises:
-        ConfigError: A setting is unknown, of the wrong type or out of range, or one that
-            training has fixed.
+        ConfigError: A setting is unknown, of the wrong type or out of range, one that training
+            has fixed, or one that could change nothing.
     """
     for name in set(settings) - set(TOLERANCE):
         if name in setting_names(config) and name.partition(".")[0] not in EVALUATED_SECTIONS:
@@ -337,7 +338,15 @@ def config_to_evaluate(config: Config, settings: Settings) -> Config:
                 f"{name} is fixed by training, allowed: settings of"
                 f" {' and '.join(EVALUATED_SECTIONS)}; train another run to change it."
             )
-    return override(config, settings)
+    changed = override(config, settings)
+    before, after = (flatten(to_dict(each)) for each in (config, changed))
+    for name in sorted(unused_settings(changed) & settings.keys()):
+        if before[name] != after[name]:
+            raise ConfigError(
+                f"{name} would change nothing for {config.method} with the other settings,"
+                " allowed: settings that are used; leave it out, or change what it belongs to."
+            )
+    return changed
 
 
 def config_to_control(config: Config, settings: Settings) -> Config:

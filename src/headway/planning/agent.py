@@ -266,7 +266,8 @@ def reset_where(state: AgentState, fresh: AgentState, done: Bool[Array, " env"])
 def hold(planner: PlannerConfig, state: Any) -> Any:
     """Go on along the last plan without a look: its next action is the state's `action`.
 
-    The transition that the action causes is not remembered, because it begins unseen.
+    The plan is what the search's distribution was centred on in the end. The transition that the
+    action causes is not remembered, because it begins unseen.
 
     Args:
         planner: What made the plan.

@@ -3,6 +3,7 @@
 import itertools
 
 from headway.config import ModelConfig, PlannerConfig
+from headway.models.dynamics import context_size
 from headway.planning.optimizers import make_optimizer
 from headway.tasks.base import Task
 
@@ -43,6 +44,7 @@ def step_flop(model: ModelConfig, planner: PlannerConfig, task: Task) -> float:
         products = [4 * (n + m) * m for n, m in itertools.pairwise(sizes)]
     total = sum(products) + sizes[-1] * outputs * task.obs_size
     if planner.adaptation != "none" and planner.adaptation_variance:
-        features = sizes[-1] + 1 + (model.context_size if model.context_at == "head" else 0)
+        context = context_size(model, task, 0)  # without the few simulator parameters of some
+        features = sizes[-1] + 1 + (context if model.context_at == "head" else 0)
         total += sizes[-1] * features
     return float(2 * total)

@@ -11,7 +11,7 @@ from rich.table import Table
 from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import ConfigError
-from headway.experiment.loading import load_agent
+from headway.experiment.loading import finished_iterations, load_agent
 from headway.experiment.methods import config_to_control
 from headway.experiment.progress import Progress
 from headway.experiment.selection import (
@@ -130,7 +130,7 @@ def _collected(
             "groups or episodes are chosen together with `collected`, allowed: one of them; the"
             " collected episodes are all of training physics."
         )
-    return {COLLECTED: run.iteration_data(run.finished_iterations - 1)}
+    return {COLLECTED: run.iteration_data(finished_iterations(run) - 1)}
 
 
 def examined(

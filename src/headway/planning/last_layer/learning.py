@@ -193,19 +193,39 @@ def doubt(
 ) -> Doubt | None:
     """How uncertain the corrections of the chosen heads are; None if plans need not know.
 
-    Several heads are averaged, and what they learned is independent given the features.
+    Several heads are averaged, and what they learned is independent given the features: the
+    variances add up, over the square of their number.
     """
     if not agent.planner.adaptation_variance or agent.prior is None:
         return None
-    groups, choices = layer.root.shape[2], heads.shape[-1]
-    group = jnp.minimum(heads[..., 0], groups - 1)
-    root = jnp.take_along_axis(layer.root, group[..., None, None, None], axis=2)[:, :, 0]
+    choices = heads.shape[-1]
+    roots = [root_of(layer, heads[..., choice]) for choice in range(choices)]
+    root = jnp.concatenate(roots, axis=-1) / choices
     rest = jnp.ones((*root.shape[:2], 1))
     if context is not None and agent.model.forward_net.context_layer is None:
         rest = jnp.concatenate([context.transpose(1, 0, 2), rest], axis=-1)
-    hidden = root.shape[-1] - rest.shape[-1]
+    hidden = root.shape[-2] - rest.shape[-1]
     bias = jnp.einsum("emij,emi->emj", root[..., hidden:, :], rest)
-    scale = jnp.sqrt(agent.prior.noise / choices) * agent.statistics.delta.std
+    scale = jnp.sqrt(agent.prior.noise) * agent.statistics.delta.std
     precision = PRECISIONS[agent.planner.precision]
     weight = root[..., :hidden, :].mT.astype(precision)
     return Doubt(Layer(weight, bias), jnp.broadcast_to(scale, (len(heads), *scale.shape)))
+
+
+def root_of(
+    layer: LastLayer, head: Int[Array, "env member"]
+) -> Float[Array, "env member feature feature"]:
+    """The square root of the covariance of one head of each member."""
+    group = jnp.minimum(head, layer.root.shape[2] - 1)[..., None, None, None]
+    return jnp.take_along_axis(layer.root, group, axis=2)[:, :, 0]
+
+
+def correction_variance(
+    layer: LastLayer,
+    prior: Prior,
+    head: Int[Array, "env member"],
+    features: Float[Array, "env member feature"],
+) -> Float[Array, "env member obs"]:
+    """Variance φᵀPφ σ² of what one head of each member adds, in normalised units."""
+    projected = jnp.einsum("emij,emi->emj", root_of(layer, head), features)
+    return jnp.square(projected).sum(-1, keepdims=True) * prior.noise

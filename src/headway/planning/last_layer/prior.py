@@ -10,7 +10,7 @@ member under which the residuals of all training episodes are most likely (type-
 likelihood; MacKay, 1992). σ² has a closed form for every ρ, so only ρ is searched for.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -67,6 +67,11 @@ class Evidence(NamedTuple):
             )
         return cls(*(np.stack(column) for column in zip(*parts, strict=True)))
 
+    @classmethod
+    def joined(cls, parts: Sequence["Evidence"]) -> "Evidence":
+        """The same of all their episodes."""
+        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
     def noise(self, ratio: float) -> Float[np.ndarray, " obs"]:
         """The most likely variance of the noise under a ratio."""
         shrunk = ratio / (1.0 + ratio * self.eigenvalues)
@@ -109,17 +114,26 @@ def fit_prior(
     """
     chosen = [trajectories[i] for i in _spread(len(trajectories), MAX_EPISODES)]
     longest = max(len(t) for t in chosen)
-    seen = []
-    for trajectory in chosen:
-        episode = Episodes.pad([trajectory], 1, longest, model.sim_param_names)
-        found = _look(model, task, statistics, episode, history_length)
-        steps = slice(len(trajectory))
-        seen.append(jax.tree.map(lambda x, s=steps: np.asarray(x[s], np.float64), found))
-    of_members = [
-        _member_prior([_of_member(one, member, rank) for one in seen], head_noise=head_noise)
-        for member in range(model.num_members)
-    ]
-    columns = (np.stack(column) for column in zip(*of_members, strict=True))
+    members = range(model.num_members)
+
+    def looks() -> Iterator[list[_OfMember]]:
+        """One episode after the other, so that the features of no two are ever held."""
+        for trajectory in chosen:
+            episode = Episodes.pad([trajectory], 1, longest, model.sim_param_names)
+            found = _look(model, task, statistics, episode, history_length)
+            steps = slice(len(trajectory))
+            seen = jax.tree.map(lambda x, s=steps: np.asarray(x[s]), found)
+            yield [_of_member(seen, member, rank) for member in members]
+
+    references = _mean_logvar(looks())
+    used = references if head_noise else [None] * len(members)
+    parts = [[*map(_reduced, episode, used)] for episode in looks()]
+    priors = []
+    for member in members:
+        evidence = Evidence.joined([episode[member] for episode in parts])
+        ratio = evidence.best_ratio()
+        priors.append((ratio, evidence.noise(ratio), references[member]))
+    columns = (np.stack(column) for column in zip(*priors, strict=True))
     return Prior(*(jnp.asarray(column, jnp.float32) for column in columns))
 
 
@@ -133,28 +147,28 @@ class _OfMember(NamedTuple):
 
 def _of_member(seen: Seen, member: int, rank: Rank) -> _OfMember:
     """The episode as the head of a rank sees it, by the summed squared error."""
-    residual = np.asarray(seen.residual)[:, member]
+    residual = np.asarray(seen.residual[:, member], np.float64)
     order = np.argsort(np.square(residual).sum((0, 2)), kind="stable")
     head = order[min(int(rank == "runner-up"), len(order) - 1)]
     logvar = np.zeros(len(residual))
     if seen.logvar is not None:
-        logvar = np.asarray(seen.logvar)[:, member, head].mean(-1)
-    return _OfMember(np.asarray(seen.features)[:, member], residual[:, head], logvar)
+        logvar = np.asarray(seen.logvar[:, member, head], np.float64).mean(-1)
+    return _OfMember(np.asarray(seen.features[:, member], np.float64), residual[:, head], logvar)
 
 
-def _member_prior(
-    episodes: list[_OfMember], *, head_noise: bool
-) -> tuple[float, Float[np.ndarray, " obs"], float]:
-    """Ratio, noise and log-reference of one member."""
-    reference = float(np.concatenate([e.logvar for e in episodes]).mean())
-    rows = []
-    for episode in episodes:
+def _mean_logvar(episodes: Iterable[list[_OfMember]]) -> list[float]:
+    """What each member's heads claim on average, as a log-variance."""
+    found = [[(one.logvar.sum(), len(one.logvar)) for one in episode] for episode in episodes]
+    sums = np.asarray(found, np.float64).sum(0)
+    return (sums[:, 0] / sums[:, 1]).tolist()
+
+
+def _reduced(episode: _OfMember, reference: float | None) -> Evidence:
+    """What the likelihood of one episode depends on; its noise is relative to a reference."""
+    relative = np.zeros(len(episode.logvar))
+    if reference is not None:
         relative = np.clip(episode.logvar - reference, -MAX_LOG_NOISE, MAX_LOG_NOISE)
-        noise = np.exp(relative * head_noise)
-        rows.append((episode.features, episode.residual, noise))
-    evidence = Evidence.of(rows)
-    ratio = evidence.best_ratio()
-    return ratio, evidence.noise(ratio), reference
+    return Evidence.of([(episode.features, episode.residual, np.exp(relative))])
 
 
 @eqx.filter_jit
