@@ -19,9 +19,9 @@ Means = dict[tuple[bool, str], tuple[float, float]]
 """Return and score by physics, which is unseen or not."""
 
 
-def last_rows(run_dir: Path) -> list[EpisodeRow]:
+def last_rows(run_dir: Path, name: str = "evaluation.csv") -> list[EpisodeRow]:
     """Test episodes after the last iteration of a run."""
-    table = read_csv(run_dir / "evaluation.csv", EVALUATION_COLUMNS)
+    table = read_csv(run_dir / name, EVALUATION_COLUMNS)
     rows = [EpisodeRow.from_csv(row) for row in table]
     last = max(row.iteration for row in rows)
     return [row for row in rows if row.iteration == last]

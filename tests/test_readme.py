@@ -31,36 +31,17 @@ def test_readme_python(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "runs/readme/figures/learning_curve.png").exists()
 
 
-class Cart(gymnasium.Env):
-    """The environment that docs/own-environment.md speaks of."""
-
-    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
-    action_space = gymnasium.spaces.Box(-3, 3, (1,), np.float32)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.mass = (options or {}).get("sim_params", {"mass": 1.0})["mass"]
-        self.state = self.np_random.uniform(-1, 1, 2)
-        return self.state.astype(np.float32), {"sim_params": {"mass": self.mass}}
-
-    def step(self, action):
-        position, velocity = self.state
-        velocity = velocity + 0.1 * float(action[0]) / self.mass
-        self.state = np.array([position + 0.1 * velocity, velocity])
-        reward = -float(self.state[0] ** 2) - 0.01 * float(action[0]) ** 2
-        return self.state.astype(np.float32), reward, False, False, {}
-
-
 @pytest.fixture(scope="module")
 def guide(tmp_path_factory):
     """What the guide to own environments defines, its run small; its folder is the current one."""
-    (code,) = python_blocks("docs/own-environment.md")
+    package, script = python_blocks("docs/own-environment.md")
     names: dict = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(catalog, "_SPECS", dict(catalog._SPECS))
         patch.chdir(tmp_path_factory.mktemp("guide"))
-        gymnasium.register("my_package/Cart-v0", Cart)
-        exec(compile(code.replace('"quick"', '"smoke"'), "own-environment.md", "exec"), names)
+        exec(compile(package, "my_package.py", "exec"), names)
+        patch.setitem(sys.modules, "my_package", types.ModuleType("my_package"))
+        exec(compile(script.replace('"quick"', '"smoke"'), "own-environment.md", "exec"), names)
         del gymnasium.registry["my_package/Cart-v0"]  # acting must do without
         yield names
 
