@@ -126,7 +126,7 @@ class Episodes(eqx.Module):
         """Gather what the context encoder sees at given steps.
 
         Slot j holds step j while fewer than K steps have passed, later a shifting window
-        (fact sheet B.2). State differences are raw; the newest transition is included.
+        (released code). State differences are raw; the newest transition is included.
 
         Args:
             episode: Rows of the episodes.
@@ -159,7 +159,7 @@ class Samples(NamedTuple):
 
         Args:
             lengths: Transitions of each episode.
-            future_length: Offsets 0 .. F-1 (F; released code, fact sheet B.4).
+            future_length: Offsets 0 .. F-1 (F; released code).
             capacity: Rows of the table, at least as many as there are valid samples.
             drop_first: Leave out anchor 0 of each episode, as the released code does.
         """
@@ -240,7 +240,7 @@ def history_action_moments(
 ) -> tuple[Float[np.ndarray, "K action"], Float[np.ndarray, "K action"]]:
     """Mean and standard deviation of each history slot's actions, padding included.
 
-    The zeros of an episode's first steps count, as in the released code (fact sheet B.3).
+    The zeros of an episode's first steps count, as in the released code.
     """
     total = squares = count = 0.0
     for trajectory in trajectories:

@@ -13,7 +13,7 @@ Adaptation = Literal["none", "last-layer"]
 
 @dataclasses.dataclass(frozen=True)
 class PlannerConfig:
-    """How actions are chosen with the model (supplement A.2; fact sheet C)."""
+    """How actions are chosen with the model (supplement A.2)."""
 
     optimizer: OptimizerName = "cem"
     """What searches for the best action sequence; settings below name those they matter to."""

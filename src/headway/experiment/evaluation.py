@@ -1,4 +1,4 @@
-"""Testing a controller on training and unseen physics (fact sheet D.2)."""
+"""Testing a controller on training and unseen physics (supplement A.2)."""
 
 import dataclasses
 import functools

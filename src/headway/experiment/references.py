@@ -1,8 +1,8 @@
 """Returns of random actions and of the paper's planner on the true dynamics.
 
-They normalise returns: score = (return - random) / (ceiling - random). Source: the
-project's fact sheet, section I, measured with 16 (Pendulum) and 12 (CartPoleSwingUp) full
-episodes per value. CartPoleSwingUp's ceiling is no upper bound for heavy poles. Its masses
+They normalise returns: score = (return - random) / (ceiling - random). They were
+measured before this package was, with 16 (Pendulum) and 12 (CartPoleSwingUp) full episodes per
+value; results/ceilings has measured them again. CartPoleSwingUp's ceiling is no upper bound for heavy poles. Its masses
 0.15, 0.25 and 2.75, and all of its shorter episodes, were measured by the methods `random` and
 `true-dynamics` of the same planner, with 16 episodes per unseen and 8 per training value
 (results/ceilings).

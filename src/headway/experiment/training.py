@@ -1,4 +1,4 @@
-"""The training loop: collect, fit, evaluate, save, and again (supplement A.2; fact sheet D)."""
+"""The training loop: collect, fit, evaluate, save, and again (supplement A.2)."""
 
 import dataclasses
 import functools

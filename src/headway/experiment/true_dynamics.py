@@ -1,4 +1,4 @@
-"""Planning on the true dynamics: the ceiling of an environment (fact sheet, section I).
+"""Planning on the true dynamics: the ceiling of an environment.
 
 The planner is the one that every method has. What it imagines with is the simulator, in the
 state and under the physics that the environments have at that moment.

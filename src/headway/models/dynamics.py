@@ -1,4 +1,4 @@
-"""The multi-headed, context-conditional dynamics model (supplement A.3; fact sheet B.1)."""
+"""The multi-headed, context-conditional dynamics model (supplement A.3)."""
 
 from typing import NamedTuple
 
@@ -185,7 +185,7 @@ class Statistics(eqx.Module):
         history_length: int,
         sim_param_names: tuple[str, ...] = (),
     ) -> "Statistics":
-        """Recompute from all data so far, as at the start of every iteration (B.3).
+        """Recompute from all data so far, as at the start of every iteration.
 
         The data are read once, in parts of `PART_TRANSITIONS`, and never held together.
 
@@ -313,7 +313,7 @@ class MultiHeadDynamics(eqx.Module):
 def flat_history(
     history: History, statistics: Statistics
 ) -> Float[Array, "member batch K_times_obs_and_action"]:
-    """What enters a context encoder; state differences are not normalised (fact sheet B.3)."""
+    """What enters a context encoder; state differences are not normalised (released code)."""
     members, batch = history.action.shape[:2]
     action = statistics.history_action.normalize(history.action)
     flat = [history.obs_diff.reshape(members, batch, -1), action.reshape(members, batch, -1)]

@@ -1,6 +1,6 @@
 """Fitting a model to the replay buffer: epochs on the device, one Adam step per batch.
 
-Supplement A.2 and A.4; fact sheet B.6 and B.7. Heads are assigned once per epoch over the
+Supplement A.2 and A.4; released `dynamics/tmcl.py`. Heads are assigned once per epoch over the
 whole data set, then forward and backward losses are minimised in mini-batches.
 """
 
@@ -123,7 +123,7 @@ def total_loss(
     weight: Float[Array, "member sample"],
     config: FittingConfig,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """What is minimised (fact sheet B.5.3), and the forward prediction loss in it.
+    """What is minimised (paper, section 3; released `tmcl.py`), and the forward prediction loss in it.
 
     Args:
         model: For its variance bounds and weights.
@@ -152,7 +152,7 @@ def total_loss(
 def assign_segments(
     model: MultiHeadDynamics, setup: FitSetup, episodes: Episodes, statistics: Statistics
 ) -> Assignment:
-    """Find the winning head of every segment of every episode (fact sheet B.6).
+    """Find the winning head of every segment of every episode (paper, section 3).
 
     Each transition is predicted with its own context; forward and backward heads are chosen
     independently. Segments past an episode's end hold head 0 and are never used.

@@ -1,4 +1,4 @@
-"""Losses over heads and the assignment of segments to heads (fact sheet B.5, B.6).
+"""Losses over heads and the assignment of segments to heads (paper, section 3).
 
 Everything is per member: heads compete within a member, never across members.
 """
@@ -61,7 +61,7 @@ def oracle_loss(
         assignment: The head that owns each sample.
         weight: 1 for a sample, 0 for padding.
         reduction: `head` averages within each head, then sums over heads, so that a head
-            counts the same however few samples it owns (released code, B.5.2); `segment`
+            counts the same however few samples it owns (released code); `segment`
             is the plain average over samples.
     """
     num_heads = losses.shape[1]

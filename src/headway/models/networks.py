@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 
 class Normalizer(eqx.Module):
-    """Shifts and scales features to zero mean and unit variance (fact sheet B.3).
+    """Shifts and scales features to zero mean and unit variance (released `tmcl.py`).
 
     A feature that never varied has `std` 0: it is shifted but not scaled, and
     `denormalize` gives back its mean whatever the network says.
@@ -108,6 +108,6 @@ def swish(x: Float[Array, "..."]) -> Float[Array, "..."]:
 def bound_logvar(
     logvar: Float[Array, "..."], low: Float[Array, "..."], high: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """Squeeze log-variances softly between learned bounds (PETS; fact sheet B.1)."""
+    """Squeeze log-variances softly between learned bounds (PETS)."""
     logvar = high - jax.nn.softplus(high - logvar)
     return low + jax.nn.softplus(logvar - low)

@@ -1,7 +1,7 @@
 """ReBAL's network: a recurrent one, fitted by truncated backpropagation through time.
 
 Nagabandi et al., "Learning to adapt in dynamic, real-world environments through
-meta-reinforcement learning" (2019). Fact sheet E.10.
+meta-reinforcement learning" (2019).
 """
 
 from typing import NamedTuple
@@ -103,7 +103,7 @@ def batch_gradient(
     """Mean squared error over whole episodes, and its gradient, truncated in time.
 
     The episodes are gone through in chunks. A chunk begins with the state that the last one
-    ended with, and no gradient flows back into that (fact sheet E.10).
+    ended with, and no gradient flows back into that.
 
     Args:
         net: The network.

@@ -1,4 +1,4 @@
-"""Relational intervention (RIA; Guo et al., ICLR 2022; fact sheet E.12).
+"""Relational intervention (RIA; Guo et al., ICLR 2022).
 
 Two contexts of one trajectory describe the same physics. Two of different trajectories may,
 too: they count as the same in so far as exchanging one for the other, an intervention, leaves

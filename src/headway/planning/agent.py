@@ -125,7 +125,7 @@ class Agent(eqx.Module):
     def act(
         self, state: AgentState, obs: Float[Array | np.ndarray, "env obs"]
     ) -> tuple[AgentState, Decision]:
-        """Choose the next action of every environment (paper, section 3.3; fact sheet C)."""
+        """Choose the next action of every environment (paper, section 3.3)."""
         act = _act_bfloat16 if self.planner.precision == "bfloat16" else _act_float32
         return act(self, state, jnp.asarray(obs, jnp.float32))
 

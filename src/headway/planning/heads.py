@@ -1,4 +1,4 @@
-"""Which prediction head plans (equation 3 of the paper; fact sheet C.3)."""
+"""Which prediction head plans (equation 3 of the paper; released `core/utils.py`)."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Imagined rollouts: candidate action sequences in, returns out (fact sheet C.2)."""
+"""Imagined rollouts: candidate action sequences in, returns out (released `dynamics/core/utils.py`)."""
 
 import dataclasses
 import functools

@@ -96,7 +96,7 @@ class Adaptive(Learner):
 
 
 class GradientAdaptation(Adaptive):
-    """GrBAL: weights from which one gradient step adapts (fact sheet E.9)."""
+    """GrBAL: weights from which one gradient step adapts (learning_to_adapt, `meta_mlp_dynamics.py`)."""
 
     @property
     def setup(self) -> MetaSetup:
@@ -129,7 +129,7 @@ class GradientAdaptation(Adaptive):
 
 
 class Recurrence(Adaptive):
-    """ReBAL: a recurrent network (fact sheet E.10)."""
+    """ReBAL: a recurrent network (learning_to_adapt, `rnn_dynamics.py`)."""
 
     @property
     def memory_length(self) -> int:

@@ -18,7 +18,7 @@ from headway.planning.optimizers.ranking import best_candidates, moments, rank_n
 
 
 class CEM(Optimizer):
-    """Cross-entropy method with clipped variance and smoothing (PETS; fact sheet C.1).
+    """Cross-entropy method with clipped variance and smoothing (PETS; released `core/utils.py`).
 
     It plans the final mean, not the best candidate. The expected return is the mean over the
     finite elites of the last iteration.
