@@ -1,11 +1,10 @@
 """Returns of random actions and of the paper's planner on the true dynamics.
 
-They normalise returns: score = (return - random) / (ceiling - random). They were
-measured before this package was, with 16 (Pendulum) and 12 (CartPoleSwingUp) full episodes per
-value; results/ceilings has measured them again. CartPoleSwingUp's ceiling is no upper bound for heavy poles. Its masses
-0.15, 0.25 and 2.75, and all of its shorter episodes, were measured by the methods `random` and
-`true-dynamics` of the same planner, with 16 episodes per unseen and 8 per training value
-(results/ceilings).
+They normalise returns: score = (return - random) / (ceiling - random). They were measured
+before this package was, with 16 (Pendulum) and 12 (CartPoleSwingUp) full episodes per value;
+results/ceilings has measured them again. CartPoleSwingUp's ceiling is no upper bound for heavy
+poles. Its masses 0.15, 0.25 and 2.75, and all of its shorter episodes, are from results/ceilings,
+with 16 episodes per unseen and 8 per training value.
 """
 
 from collections.abc import Mapping, Sequence

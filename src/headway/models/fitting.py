@@ -123,7 +123,7 @@ def total_loss(
     weight: Float[Array, "member sample"],
     config: FittingConfig,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """What is minimised (paper, section 3; released `tmcl.py`), and the forward prediction loss in it.
+    """What is minimised (paper, section 3), and the forward prediction loss in it.
 
     Args:
         model: For its variance bounds and weights.

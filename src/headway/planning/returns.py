@@ -1,4 +1,4 @@
-"""Imagined rollouts: candidate action sequences in, returns out (released `dynamics/core/utils.py`)."""
+"""Imagined rollouts: candidate action sequences in, returns out (released `core/utils.py`)."""
 
 import dataclasses
 import functools

@@ -96,7 +96,10 @@ class Adaptive(Learner):
 
 
 class GradientAdaptation(Adaptive):
-    """GrBAL: weights from which one gradient step adapts (learning_to_adapt, `meta_mlp_dynamics.py`)."""
+    """GrBAL: weights from which one gradient step adapts.
+
+    Source: learning_to_adapt, `meta_mlp_dynamics.py`.
+    """
 
     @property
     def setup(self) -> MetaSetup:
