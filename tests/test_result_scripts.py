@@ -24,9 +24,9 @@ def run_dir(tmp_path_factory):
 def run_script(monkeypatch):
     """Call a script as from the command line; returns its names."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
+    sys.modules.pop("measure", None)  # there are several
 
     def run(name, *words):
-        monkeypatch.delitem(sys.modules, "measure", raising=False)  # there are several
         monkeypatch.setattr(sys, "argv", [name, *map(str, words)])
         return runpy.run_path(str(SCRIPTS / name), run_name="__main__")
 
@@ -61,12 +61,18 @@ def test_arms_and_changes_of_physics(run_dir, run_script, tmp_path, capsys):
     assert capsys.readouterr().out == ""  # nothing was missing
 
 
-def test_recovery_of_a_pendulum(monkeypatch):
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    monkeypatch.delitem(sys.modules, "measure", raising=False)
+@pytest.mark.usefixtures("run_script")
+def test_recovery_of_a_pendulum():
     recovery_steps = runpy.run_path(str(SCRIPTS / "changes.py"))["recovery_steps"]
     reward = [0.0] * 50 + [-8.0] * 30 + [-0.1] * 70
-    sys.modules.pop("measure")
     assert recovery_steps("pendulum", reward, 50) == 29  # one bad step of 20 is let pass
     assert recovery_steps("pendulum", reward[:90], 50) == 40
     assert recovery_steps("half-cheetah", [2.0] * 50 + [0.0] * 5 + [2.0] * 60, 50) == 3
+
+
+@pytest.mark.usefixtures("run_script")
+def test_a_drift_goes_to_its_end_in_equal_steps():
+    lengths = runpy.run_path(str(SCRIPTS / "changes.py"))["lengths"]
+    assert lengths(1.0, 0.5).schedule(20) == {20: {"length": 0.5}}
+    drift = lengths(0.5, 1.5, over=4).schedule(20)
+    assert drift == {20 + i: {"length": 0.75 + 0.25 * i} for i in range(4)}

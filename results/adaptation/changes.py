@@ -7,7 +7,8 @@ skipped, and so are arms that a method does not have.
 
 Recovered is the first step after the change from which the mean reward of 20 steps reaches 90 % of
 the way from a random controller's to that of a balanced pendulum (Pendulum), or 90 % of that of the
-20 steps before the change (others); where it never happens, the steps that were left.
+20 steps before the change (others); where it never happens, the steps that were left. A drift's
+steps count from its beginning.
 """
 
 import argparse
@@ -15,7 +16,7 @@ import json
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -31,7 +32,7 @@ from headway.storage.records import read_csv, write_csv
 from headway.storage.run_dir import RunDir
 
 COLUMNS = (
-    "run", "env", "method", "seed", "arm", "settings", "step", "episode", "before", "after",
+    "run", "env", "method", "seed", "arm", "settings", "step", "episode", "before", "after", "over",
     "return_after", "reward_before", "recovery_steps",
 )  # fmt: skip
 ARMS: dict[str, dict[str, Any]] = {
@@ -43,22 +44,57 @@ ARMS: dict[str, dict[str, Any]] = {
     "last-layer, evidence": LAST_LAYER | {"planner.head_selection": "evidence"},
 }
 """Settings that the run is tested with, by name."""
-CHANGES: dict[str, tuple[tuple[dict[str, float], dict[str, float]], ...]] = {
+
+
+class Change(NamedTuple):
+    """Physics that begin as they are in training, and what they become."""
+
+    before: dict[str, float]
+    after: dict[str, float]
+    """Only what changes."""
+    over: int = 1
+    """Steps that it takes: 1 is a jump, more a steady drift."""
+
+    def schedule(self, step: int) -> dict[int, dict[str, float]]:
+        """The physics from a step on."""
+        return {
+            step + i: {
+                name: self.before[name] + (value - self.before[name]) * (i + 1) / self.over
+                for name, value in self.after.items()
+            }
+            for i in range(self.over)
+        }
+
+
+def lengths(before: float, after: float, over: int = 1) -> Change:
+    """A pendulum whose length changes."""
+    return Change({"length": before, "mass": 1.0}, {"length": after}, over)
+
+
+def robots(before: float, **after: float) -> Change:
+    """A robot of some mass that changes."""
+    return Change({"mass_scale": before, "damping_scale": 1.0}, after)
+
+
+CHANGES: dict[str, tuple[Change, ...]] = {
     "pendulum": (
-        ({"length": 1.25, "mass": 1.0}, {"length": 0.5}),
-        ({"length": 0.5, "mass": 1.0}, {"length": 1.25}),
-        ({"length": 1.0, "mass": 1.0}, {"length": 0.25}),
-        ({"length": 1.0, "mass": 1.0}, {"length": 1.75}),
-        ({"length": 1.0, "mass": 1.0}, {"mass": 2.0}),
+        lengths(1.25, 0.5),
+        lengths(0.5, 1.25),
+        lengths(1.0, 0.25),
+        lengths(1.0, 1.75),
+        Change({"length": 1.0, "mass": 1.0}, {"mass": 2.0}),
+        lengths(0.5, 1.25, over=100),
+        lengths(1.25, 0.5, over=100),
+        lengths(1.0, 1.75, over=100),
     ),
     "half-cheetah": (
-        ({"mass_scale": 0.5, "damping_scale": 1.0}, {"mass_scale": 1.5}),
-        ({"mass_scale": 1.5, "damping_scale": 1.0}, {"mass_scale": 0.5}),
-        ({"mass_scale": 1.5, "damping_scale": 1.0}, {"mass_scale": 3.0}),
-        ({"mass_scale": 1.5, "damping_scale": 1.0}, {"damping_scale": 2.0}),
+        robots(0.5, mass_scale=1.5),
+        robots(1.5, mass_scale=0.5),
+        robots(1.5, mass_scale=3.0),
+        robots(1.5, damping_scale=2.0),
     ),
 }
-"""Physics before and what changes, from training physics to training or unseen ones."""
+"""From training physics to training or unseen ones."""
 REWARDS = {"pendulum": (-6.0, 0.0)}
 """Mean rewards of random actions and of a balanced pendulum, where rewards are costs."""
 WINDOW = 20
@@ -81,8 +117,8 @@ def measure(
     config = config_to_evaluate(run.config(), settings)
     changes = CHANGES[config.env]
     episodes = [
-        Episode(before, SEED + i, {step: after})
-        for i, (before, after) in enumerate(changes * per_change)
+        Episode(change.before, SEED + i, change.schedule(step))
+        for i, change in enumerate(changes * per_change)
     ]
     found = act(run, config, episodes)
     return [
@@ -92,13 +128,14 @@ def measure(
             "seed": config.seed,
             "step": step,
             "episode": i // len(changes),
-            "before": json.dumps(episode.sim_params),
-            "after": json.dumps(episode.schedule[step]),
+            "before": json.dumps(changes[i % len(changes)].before),
+            "after": json.dumps(changes[i % len(changes)].after),
+            "over": changes[i % len(changes)].over,
             "return_after": float(trajectory.reward[step:].sum()),
             "reward_before": float(trajectory.reward[step - WINDOW : step].mean()),
             "recovery_steps": recovery_steps(config.env, trajectory.reward, step),
         }
-        for i, (episode, trajectory) in enumerate(zip(episodes, found, strict=True))
+        for i, trajectory in enumerate(found)
     ]
 
 

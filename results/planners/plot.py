@@ -113,10 +113,11 @@ def draw(axes: Axes, points: Sequence[Point], numbers: dict[str, int]) -> None:
 def save_figure(points: dict[str, list[Point]], value: str, path: Path, source: str) -> None:
     """Draw a panel for each kind of physics."""
     num_runs = max(len(point.values) for found in points.values() for point in found)
+    several = "; thin lines: lowest and highest run" * (num_runs > 1)
     caption = (
-        f"Means over {num_runs} run{'s' * (num_runs > 1)} of {source}; thin lines: lowest and"
-        " highest run. Line and bold numbers: planners that no cheaper one equals. FLOP: matrix"
-        " products of the imagined rollouts that were really evaluated."
+        f"Means over {num_runs} run{'s' * (num_runs > 1)} of {source}{several}. Line and bold"
+        " numbers: planners that no cheaper one equals. FLOP: matrix products of the imagined"
+        " rollouts that were really evaluated."
     )
     title = f"{value.capitalize()} against planning cost"
     numbers = numbered(points)
