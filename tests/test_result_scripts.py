@@ -24,14 +24,20 @@ def run_dir(tmp_path_factory):
 def run_script(monkeypatch):
     """Call a script as from the command line; returns its names."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
-    sys.modules.pop("measure", None)  # there are several
+    forget_scripts()
 
     def run(name, *words):
         monkeypatch.setattr(sys, "argv", [name, *map(str, words)])
         return runpy.run_path(str(SCRIPTS / name), run_name="__main__")
 
     yield run
-    sys.modules.pop("measure", None)
+    forget_scripts()
+
+
+def forget_scripts():
+    """Other folders have scripts of the same names."""
+    for script in SCRIPTS.glob("*.py"):
+        sys.modules.pop(script.stem, None)
 
 
 def test_rules_of_selection_are_compared_on_the_same_episodes(run_dir, run_script, tmp_path):
@@ -59,6 +65,10 @@ def test_arms_and_changes_of_physics(run_dir, run_script, tmp_path, capsys):
     capsys.readouterr()
     run_script("changes.py", *words)
     assert capsys.readouterr().out == ""  # nothing was missing
+    figure = tmp_path / "changes.png"
+    run_script("by_change.py", tmp_path, figure)
+    assert "| length 0.5 → 1.25 in 100 steps |" in capsys.readouterr().out
+    assert figure.stat().st_size > 10_000
 
 
 @pytest.mark.usefixtures("run_script")

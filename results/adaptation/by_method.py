@@ -42,14 +42,14 @@ def order(scores: Scores) -> list[str]:
 
 
 def draw(axes: Axes, scores: Scores, methods: list[str]) -> None:
-    """A line per method; a dot per run, a bar at each arm's mean."""
-    for y, method in enumerate(methods):
-        arms = list(scores[method].items())
-        means = [np.mean(values) for _, values in arms]
-        axes.plot([min(means), max(means)], [y, y], color=style.THREAD, lw=3, zorder=1)
-        for (_, values), mean, color in zip(arms, means, COLORS, strict=False):
+    """A row per method, with an arm above the other; a dot per run, a bar at each arm's mean."""
+    for row, method in enumerate(methods):
+        arms = list(scores[method].values())
+        places = row + 0.2 * (np.arange(len(arms)) - (len(arms) - 1) / 2)
+        axes.plot([np.mean(values) for values in arms], places, color=style.THREAD, lw=3, zorder=1)
+        for values, y, color in zip(arms, places, COLORS, strict=False):
             axes.plot(values, [y] * len(values), "o", color=color, ms=4, alpha=0.6)
-            axes.plot(mean, y, "|", color=color, ms=16, mew=2.5)
+            axes.plot(np.mean(values), y, "|", color=color, ms=11, mew=2.5)
     axes.set_yticks(range(len(methods)), methods)
     axes.set_ylim(len(methods) - 0.5, -0.5)
     axes.grid(visible=True, axis="x")
