@@ -18,6 +18,7 @@ import jax
 import numpy as np
 from growth_axes import AXES, NUM_ENVS, PLANNER, Axis, Work
 from machine import facts
+from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, NullLocator
 from reporting import LATEST, markdown_table, write_result
 
 from headway.report.style import FAINT, TRAINING, figure, label_axis, legend
@@ -85,7 +86,7 @@ def draw(curves: dict[str, Curve], path: Path, machine: str) -> None:
     """Small multiples on logarithmic axes, each with a line of linear growth."""
     columns, rows = 4, -(-len(curves) // 4)
     caption = (
-        f"The number is the exponent over the upper half of the range. Small networks, {NUM_ENVS} "
+        f"Exponents are over the upper half of the range; 1 is linear. Small networks, {NUM_ENVS} "
         f"environments, {PLANNER.num_candidates} candidates, horizon {PLANNER.horizon} unless "
         f"varied. {machine}."
     )
@@ -97,9 +98,14 @@ def draw(curves: dict[str, Curve], path: Path, machine: str) -> None:
             linear = seconds[-1] * sizes / sizes[-1]
             axes.loglog(sizes, seconds, "o-", color=TRAINING, ms=4, label="median of one call")
             axes.loglog(sizes, linear, "--", color=FAINT, lw=1, label="linear growth")
-            axes.set_title(f"{curve['what']}: {exponent(curve['points']):.2f}")
+            axes.set_title(f"{curve['what']}, exponent {exponent(curve['points']):.2f}")
             label_axis(axes, curve["unit"], "seconds" if i % columns == 0 else "")
-            axes.minorticks_off()
+            for axis, ends in ((axes.xaxis, sizes), (axes.yaxis, seconds)):
+                wide = max(ends) > 50 * min(ends)
+                axis.set_major_locator(LogLocator(subs=(1,) if wide else (1, 2, 5)))
+                axis.set_minor_locator(NullLocator())
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         legend(drawing)
 
 
