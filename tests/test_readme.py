@@ -12,7 +12,12 @@ import pytest
 
 import headway
 from headway.cli import main
+from headway.config import model
+from headway.errors import ConfigError
+from headway.experiment import learners, methods
+from headway.experiment.loading import load_agent
 from headway.settings import setting_names
+from headway.storage.run_dir import RunDir
 from headway.tasks import catalog
 
 ROOT = Path(__file__).parent.parent
@@ -163,3 +168,67 @@ def test_settings_that_the_pages_name_exist():
             r"`((?:model|fitting|planner|collection|evaluation)\.(?!csv)[a-z_]+)", page.read_text()
         )
         assert set(named) <= set(known), page.name
+
+
+@pytest.fixture(scope="module")
+def ridge(tmp_path_factory):
+    """What the guide to own methods defines, its run small."""
+    (code,) = python_blocks("docs/methods.md")
+    names: dict = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(methods, "METHODS", dict(methods.METHODS))
+        patch.setattr(learners, "_LEARNERS", dict(learners._LEARNERS))
+        patch.setattr(model, "OWN_KINDS", set())
+        patch.setattr(learners, "OWN_KINDS", model.OWN_KINDS)
+        patch.chdir(tmp_path_factory.mktemp("methods"))
+        exec(compile(code.replace('"quick"', '"smoke"'), "methods.md", "exec"), names)
+        yield names
+
+
+def test_own_method_guide(ridge):
+    run = ridge["run"]
+    assert run.config.method == "ridge"
+    again = headway.evaluate(run.path, num_episodes=1)
+    assert len(again) == 3
+    controller = headway.load(run.path)
+    controller.reset()
+    assert controller.act(np.zeros(3)).shape == (1,)
+    assert (run.path / "figures/learning_curve.png").exists()
+    assert "ridge" in headway.write_report([run.path], run.path / "report.html").read_text()
+
+
+@pytest.mark.usefixtures("ridge")
+def test_an_own_learner_is_fitted_resumed_and_planned_with(tmp_path):
+    """On dynamics that are linear it is exact, and a run goes on where it was."""
+    settings = {"collection.num_iterations": 1}
+    first = headway.train(
+        "pendulum", method="ridge", preset="smoke", run_dir=tmp_path / "a", settings=settings
+    )
+    weight = load_agent(RunDir(first.path)).model.parameters  # pyright: ignore
+    trajectories = RunDir(first.path).load_data()
+    obs, action, next_obs = (
+        np.concatenate([getattr(t, name)[part] for t in trajectories])
+        for name, part in (
+            ("obs", slice(None, -1)),
+            ("action", slice(None)),
+            ("obs", slice(1, None)),
+        )
+    )
+    x = np.concatenate([obs, action, np.ones((len(obs), 1))], axis=1)
+    expected = np.linalg.lstsq(x, next_obs - obs)[0]
+    np.testing.assert_allclose(x @ weight, x @ expected, atol=1e-3)
+
+
+@pytest.mark.usefixtures("ridge")
+def test_what_cannot_be_registered():
+    for name in ("tmcl", ""):
+        with pytest.raises(ConfigError, match="is not free"):
+            headway.register_method(headway.Method(name, "taken", {}))
+    with pytest.raises(ConfigError, match=r"unknown setting 'model\.heads'"):
+        headway.register_method(headway.Method("mine", "misspelt", {"model.heads": 3}))
+    with pytest.raises(ConfigError, match="is not free"):
+        headway.register_learner("recurrent", headway.Learner)
+    with pytest.raises(ConfigError, match="no Learner"):
+        headway.register_learner("mine", dict)
+    with pytest.raises(ConfigError, match="kind is 'unheard'"):
+        headway.make_config("pendulum", settings={"model.kind": "unheard"})

@@ -30,12 +30,21 @@ if TYPE_CHECKING:
     from headway.errors import RunError as RunError
     from headway.errors import SeedsError as SeedsError
     from headway.errors import UnknownNameError as UnknownNameError
+    from headway.experiment.learners import Fit as Fit
+    from headway.experiment.learners import Learned as Learned
+    from headway.experiment.learners import Learner as Learner
+    from headway.experiment.learners import register_learner as register_learner
     from headway.experiment.methods import METHODS as METHODS
-    from headway.experiment.methods import PRESETS as PRESETS
+    from headway.experiment.methods import Method as Method
     from headway.experiment.methods import make_config as make_config
+    from headway.experiment.methods import register_method as register_method
+    from headway.experiment.presets import PRESETS as PRESETS
     from headway.models.dynamics import MultiHeadDynamics as MultiHeadDynamics
+    from headway.models.fitting import EpochStats as EpochStats
     from headway.planning.agent import Agent as Agent
     from headway.planning.controller import Controller as Controller
+    from headway.planning.meta.agent import AdaptiveAgent as AdaptiveAgent
+    from headway.planning.meta.function import FunctionModel as FunctionModel
     from headway.planning.optimizers import CEM as CEM
     from headway.planning.optimizers import ICEM as ICEM
     from headway.planning.optimizers import MPPI as MPPI
@@ -74,10 +83,15 @@ _HOME = {
         "SeedsError",
         "UnknownNameError",
     ),
-    "experiment.methods": ("METHODS", "PRESETS", "make_config"),
+    "experiment.learners": ("Fit", "Learned", "Learner", "register_learner"),
+    "experiment.methods": ("METHODS", "Method", "make_config", "register_method"),
+    "experiment.presets": ("PRESETS",),
     "models.dynamics": ("MultiHeadDynamics",),
+    "models.fitting": ("EpochStats",),
     "planning.agent": ("Agent",),
     "planning.controller": ("Controller",),
+    "planning.meta.agent": ("AdaptiveAgent",),
+    "planning.meta.function": ("FunctionModel",),
     "planning.optimizers": ("CEM", "ICEM", "MPPI", "RandomShooting"),
     "report.diagnosis": ("Diagnosis", "diagnose"),
     "report.dynamics": ("plot_dynamics",),

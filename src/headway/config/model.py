@@ -9,6 +9,9 @@ from headway.errors import shown
 from headway.problems import Problems
 
 ModelKind = Literal["multi-headed", "gradient-adapted", "recurrent", "simulator", "none"]
+BUILT_IN_KINDS: tuple[str, ...] = typing.get_args(ModelKind)
+OWN_KINDS: set[str] = set()
+"""Kinds that were registered (`headway.register_learner`)."""
 ContextKind = Literal["learned", "history", "sim-params"]
 ContextPlace = Literal["input", "last-hidden", "head"]
 
@@ -30,8 +33,8 @@ class ModelConfig:
     kind: ModelKind = "multi-headed"
     """What predicts: an ensemble of multi-headed networks; one network that a gradient step
     adapts to the newest transitions (GrBAL); a recurrent one (ReBAL); the simulator itself; or
-    nothing, and actions are random. All but the first have one member, one head, no context and
-    no variance."""
+    nothing, and actions are random. All of these but the first have one member, one head, no
+    context and no variance. Or one of your own (`headway.register_learner`)."""
     num_members: int = 5
     """Networks in the ensemble."""
     num_heads: int = 3
@@ -77,8 +80,8 @@ class ModelConfig:
         problems.at_least(0, "context_size")
         problems.sizes("hidden_sizes")
         problems.sizes("context_hidden_sizes")
-        problems.one_of("kind", typing.get_args(ModelKind))
-        if self.kind != "multi-headed":
+        problems.one_of("kind", (*BUILT_IN_KINDS, *sorted(OWN_KINDS)))
+        if self.kind in BUILT_IN_KINDS and self.kind != "multi-headed":
             plain = {name: getattr(self, name) for name in PLAIN}
             problems.require(
                 plain == PLAIN,

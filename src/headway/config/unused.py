@@ -8,6 +8,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 
 from headway.config.fitting import FittingConfig
+from headway.config.model import BUILT_IN_KINDS
 from headway.config.planner import PlannerConfig
 from headway.config.run import Config
 
@@ -27,7 +28,12 @@ OPTIMIZER_SETTINGS: Mapping[str, tuple[str, ...]] = {
 
 
 def unused_settings(config: Config) -> frozenset[str]:
-    """Dotted names of the settings whose values make no difference to this run's results."""
+    """Dotted names of the settings whose values make no difference to this run's results.
+
+    What a registered kind of model uses is not known, so all of them count.
+    """
+    if config.model.kind not in BUILT_IN_KINDS:
+        return frozenset()
     idle = {name for used, names in _USED_WHEN if not used(config) for name in names}
     return frozenset(idle | _of_other_optimizers(config.planner))
 

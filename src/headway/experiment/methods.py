@@ -1,20 +1,18 @@
-"""The table of methods and presets: named settings, not classes.
+"""The table of methods: named settings, not classes; and how a configuration is put together.
 
 A configuration starts from the paper's defaults, takes the preset's settings, then the
 method's, then the user's.
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 from headway.config import PLAIN, Config
 from headway.config.unused import unused_settings
 from headway.errors import ConfigError, unknown_name
+from headway.experiment.presets import PRESETS, Settings
 from headway.settings import TOLERANCE, flatten, override, setting_names, to_dict
-from headway.tasks.catalog import EnvSpec, env_spec, episode_length, sim_param_sets
-
-Settings = Mapping[str, Any]
+from headway.tasks.catalog import env_spec, episode_length, sim_param_sets
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,19 +24,6 @@ class Method:
     settings: Settings
     by_preset: Mapping[str, Settings] = dataclasses.field(default_factory=dict)
     """What replaces some of them in a preset, by its name."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Preset:
-    """A scale of experiment; `settings` may depend on the environment.
-
-    What only some methods can use belongs in their `Method.by_preset`: whatever a preset sets is
-    in the directory names of all its runs (`headway.sweeps.jobs.fingerprint`).
-    """
-
-    name: str
-    description: str
-    settings: Callable[[EnvSpec], Settings]
 
 
 _NO_CONTEXT: Settings = {"model.context_size": 0, "model.backward_net": False}
@@ -193,90 +178,26 @@ _METHODS = (
 )
 
 
-def _paper(spec: EnvSpec) -> Settings:
-    return {"fitting.epochs": spec.epochs}
-
-
-_FAST_PLANNER: Settings = {
-    "planner.num_candidates": 100,
-    "planner.num_elites": 20,
-    "planner.num_iterations": 3,
-    "planner.num_particles": 5,
-}
-
-
-def _fast(spec: EnvSpec) -> Settings:
-    return {**_paper(spec), **_FAST_PLANNER}
-
-
-def _released_code(spec: EnvSpec) -> Settings:
-    options = {"observe_average_velocity": False}
-    return {
-        "fitting.epochs": spec.epochs,
-        "env_options": {name: options[name] for name in options if name in spec.options},
-        "fitting.bootstrap": True,
-        "fitting.drop_first_anchor": True,
-        "fitting.context_weight_decay": False,
-        "planner.selection_error": "sampled",
-        "planner.selection_skips_newest": True,
-        "planner.reward": "released",
-    }
-
-
-def _quick(spec: EnvSpec) -> Settings:
-    return {
-        "model.hidden_sizes": (128, 128, 128, 128),
-        "collection.num_iterations": 5,
-        "collection.num_episodes": 5,
-        "collection.episode_length": min(spec.episode_length, 200),
-        "fitting.epochs": 20,
-        "fitting.warmup_iterations": 2,
-        "fitting.relation_transitions": 20,
-        "planner.horizon": 20,
-        **_FAST_PLANNER,
-        "evaluation.every": 5,
-        "evaluation.num_episodes": 8,
-    }
-
-
-def _smoke(spec: EnvSpec) -> Settings:
-    del spec
-    return {
-        "model.num_members": 2,
-        "model.hidden_sizes": (16, 16),
-        "model.context_hidden_sizes": (16,),
-        "collection.num_iterations": 2,
-        "collection.num_episodes": 2,
-        "collection.episode_length": 20,
-        "fitting.epochs": 2,
-        "fitting.batch_size": 32,
-        "fitting.warmup_iterations": 1,
-        "fitting.relation_transitions": 4,
-        "planner.horizon": 4,
-        "planner.num_candidates": 16,
-        "planner.num_elites": 4,
-        "planner.num_iterations": 2,
-        "planner.num_particles": 2,
-        "evaluation.num_episodes": 2,
-    }
-
-
-_PRESETS = (
-    Preset("paper", "the supplement's numbers; wants a GPU", _paper),
-    Preset("fast", "the paper's, but for a planner of a thirteenth of its arithmetic", _fast),
-    Preset("quick", "a smaller network, planner and schedule; minutes on a laptop", _quick),
-    Preset("smoke", "tiny sizes that only show that everything runs; seconds", _smoke),
-    Preset(
-        "released-code",
-        "the paper's numbers with every choice of the released code that differs from the paper",
-        _released_code,
-    ),
-)
-
 EVALUATED_SECTIONS = ("planner", "evaluation")  # what a trained run can be tested with
 
 METHODS: dict[str, Method] = {method.name: method for method in _METHODS}
-PRESETS: dict[str, Preset] = {preset.name: preset for preset in _PRESETS}
+_BUILT_IN = tuple(METHODS)
+
+
+def register_method(method: Method) -> None:
+    """Add a method of your own, or replace an earlier one of the same name.
+
+    Its settings may name a `model.kind` of your own (`learners.register_learner`).
+
+    Raises:
+        ConfigError: It has the name of a built-in method, or its settings are not allowed.
+    """
+    if method.name in _BUILT_IN or not method.name:
+        raise ConfigError(
+            f"method name {method.name!r} is not free, allowed: any but {', '.join(_BUILT_IN)}."
+        )
+    override(Config(env="pendulum", method=method.name), method.settings)
+    METHODS[method.name] = method
 
 
 def make_config(

@@ -1,6 +1,8 @@
 """The kinds of models that a run can train, behind one interface; `model.kind` chooses."""
 
 from headway.config import Config
+from headway.config.model import BUILT_IN_KINDS, OWN_KINDS
+from headway.errors import ConfigError
 from headway.experiment.learners.adaptive import GradientAdaptation, Recurrence
 from headway.experiment.learners.base import Fit as Fit
 from headway.experiment.learners.base import Learned as Learned
@@ -16,6 +18,29 @@ _LEARNERS: dict[str, type[Learner]] = {
     "simulator": Simulator,
     "none": Random,
 }
+
+
+def register_learner(kind: str, learner: type[Learner]) -> None:
+    """Add a kind of model of your own; `model.kind` then chooses it.
+
+    A program that reads its runs must have registered it too. Runs of it cannot go side by side
+    on Ray.
+
+    Args:
+        kind: Its name.
+        learner: How it begins, is fitted and acts.
+
+    Raises:
+        ConfigError: The name is a built-in one, or the class is no `Learner`.
+    """
+    if not kind or kind in BUILT_IN_KINDS:
+        raise ConfigError(
+            f"model kind {kind!r} is not free, allowed: any but {', '.join(BUILT_IN_KINDS)}."
+        )
+    if not (isinstance(learner, type) and issubclass(learner, Learner)):
+        raise ConfigError(f"{learner!r} is no Learner, allowed: a class that inherits from it.")
+    OWN_KINDS.add(kind)
+    _LEARNERS[kind] = learner
 
 
 def make_learner(config: Config, task: Task, episode_length: int) -> Learner:
