@@ -1,0 +1,170 @@
+"""Training for adaptation: features from which heads learn quickly.
+
+An ordinary fit asks how well a head predicts. The loss here asks how well it predicts once it
+has learned, in closed form, from what the episode has shown: the first n transitions of a
+training episode are learned from as `regression` does while acting, and all later ones are
+judged. Its gradient goes through the regression into the features.
+
+- **The later transitions**, not just the next one: a plan imagines many steps. They see the context of
+  moment n, as a plan made then would.
+- **n is log-uniform**, because the posterior changes most in the beginning.
+- **Two heads per task**, the one that explains the episode best and the second best. The first is
+  what acts on known physics; the second imitates physics that no head was made for, with no data
+  but those of training.
+- **Heads are held fixed** in this loss: the ordinary loss goes on beside it and alone decides what
+  each head is made for. Else the second-best head would be drawn to the physics of the best.
+- **The noise variance is the most likely one** of each task, head and dimension. So tasks count by how
+  much better they become, not by how large their errors are.
+
+ALPaCA (Harrison et al., 2018) trains features through the same regression, for one network
+without heads.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from headway.models.dynamics import MultiHeadDynamics
+from headway.models.fitting import FitData, FitSetup
+from headway.planning.last_layer.prior import MIN_NOISE
+from headway.planning.last_layer.regression import Seen, see_episode
+from headway.tasks.base import Task
+
+STEP = 0.1
+"""Adam's step, as a share of `fitting.learning_rate`."""
+
+
+def for_adaptation(setup: FitSetup) -> FitSetup:
+    """The same setup with the smaller steps of these epochs."""
+    config = dataclasses.replace(setup.config, learning_rate=STEP * setup.config.learning_rate)
+    return FitSetup(setup.task, config, setup.history_length)
+
+
+class Moment(NamedTuple):
+    """A moment of a training episode: what came before is learned from."""
+
+    episode: Int[Array, ""]
+    step: Int[Array, ""]
+    """Transitions before it (n)."""
+
+    @classmethod
+    def draw(cls, data: FitData, key: PRNGKeyArray) -> "Moment":
+        """Draw an episode in proportion to its length, and a step at least 1, log-uniformly."""
+        row_key, step_key = jax.random.split(key)
+        episode = data.samples.episode[jax.random.randint(row_key, (), 0, data.samples.count)]
+        length = data.episodes.length[episode]
+        step = jnp.floor(length ** jax.random.uniform(step_key)).astype(length.dtype)
+        return cls(episode, jnp.clip(step, 1, jnp.maximum(length - 1, 1)))
+
+
+class AdaptationLoss(eqx.Module):
+    """How badly heads predict the rest of a random training episode, having learned so far."""
+
+    task: Task
+    history_length: int = eqx.field(static=True)
+    ratio: Float[Array, " member"]
+    """Prior variance of a correction over the variance of the noise (ρ), from `prior`."""
+
+    def __call__(
+        self, model: MultiHeadDynamics, data: FitData, key: PRNGKeyArray
+    ) -> Float[Array, ""]:
+        """Draw an episode and a moment, the same for all members; the sum over members."""
+        return self.at(model, data, Moment.draw(data, key)).sum()
+
+    def at(
+        self, model: MultiHeadDynamics, data: FitData, moment: Moment
+    ) -> Float[Array, " member"]:
+        """The loss of each member at one moment."""
+        steps = jnp.arange(data.episodes.action.shape[1])
+        learned = steps < moment.step
+        judged = ~learned & (steps < data.episodes.length[moment.episode])
+        seen = see_episode(
+            with_fixed_heads(model),
+            self.task,
+            data.statistics,
+            data.episodes,
+            moment.episode,
+            jnp.where(learned, steps + 1, moment.step),
+            self.history_length,
+        )
+        residual = of_best_heads(seen, learned | judged)
+        loss = jax.vmap(loss_after_learning, in_axes=(1, 1, None, None, 0))
+        return loss(seen.features, residual, learned, judged, self.ratio)
+
+
+def with_fixed_heads(model: MultiHeadDynamics) -> MultiHeadDynamics:
+    """The same model, whose heads no gradient reaches."""
+    heads = jax.lax.stop_gradient(model.forward_net.mean_heads)
+    return eqx.tree_at(lambda model: model.forward_net.mean_heads, model, heads)
+
+
+def of_best_heads(
+    seen: Seen, valid: Bool[Array, " time"], most: int = 2
+) -> Float[Array, "time member rank obs"]:
+    """Residuals of the heads that explain the episode best, by the summed squared error.
+
+    Args:
+        seen: The transitions of the episode.
+        valid: Which of them there are.
+        most: How many heads, if there are so many.
+    """
+    squared = jnp.where(valid[:, None, None, None], jnp.square(seen.residual), 0.0)
+    best = jnp.argsort(squared.sum((0, 3)), axis=-1)[:, :most]
+    return jnp.take_along_axis(seen.residual, best[None, :, :, None], axis=2)
+
+
+def loss_after_learning(
+    features: Float[Array, "time feature"],
+    residual: Float[Array, "time rank obs"],
+    learned: Bool[Array, " time"],
+    judged: Bool[Array, " time"],
+    ratio: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Gaussian NLL of some transitions after others were learned from.
+
+    In the units of `losses.negative_log_likelihood`: averaged over transitions, dimensions and
+    heads, twice the log-density, without constants. 0 where there is nothing to judge.
+
+    Args:
+        features: What the heads see.
+        residual: What they leave unexplained.
+        learned: Transitions to learn from.
+        judged: Transitions to predict then.
+        ratio: Of the prior (ρ).
+    """
+    weight, triangle = posterior(features, residual, learned, ratio)
+    error = residual - jnp.einsum("ti,iko->tko", features, weight)
+    projected = solve_triangular(triangle, features.T, trans="T")
+    spread = 1.0 + jnp.square(projected).sum(0)
+    share = judged / jnp.maximum(judged.sum(), 1)
+    noise = jnp.einsum("t,tko->ko", share / spread, jnp.square(error))
+    loss = jnp.log(jnp.maximum(noise, MIN_NOISE)).mean() + (share * jnp.log(spread)).sum()
+    return jnp.where(judged.any(), loss, 0.0)
+
+
+def posterior(
+    features: Float[Array, "time feature"],
+    residual: Float[Array, "time rank obs"],
+    learned: Bool[Array, " time"],
+    ratio: Float[Array, ""],
+) -> tuple[Float[Array, "feature rank obs"], Float[Array, "feature feature"]]:
+    """What `regression.update` comes to after some transitions, all at once.
+
+    By a QR decomposition of the features over the prior, because the normal equations lose the
+    prior in float32 where the ratio is large.
+
+    Returns:
+        The mean of the corrections, and R with P = (RᵀR)⁻¹.
+    """
+    size = features.shape[-1]
+    rows = jnp.where(learned[:, None], features, 0.0)
+    orthogonal, triangle = jnp.linalg.qr(jnp.concatenate([rows, jnp.eye(size) / jnp.sqrt(ratio)]))
+    known = jnp.where(learned[:, None, None], residual, 0.0)
+    projected = jnp.einsum("ti,tko->iko", orthogonal[: len(rows)], known)
+    flat = solve_triangular(triangle, projected.reshape(size, -1))
+    return flat.reshape(projected.shape), triangle
