@@ -1,6 +1,5 @@
 """Training for adaptation: the loss is that of the heads that act, and its training helps them."""
 
-import dataclasses
 import functools
 
 import equinox as eqx
@@ -94,25 +93,40 @@ def test_the_loss_is_that_of_heads_which_learned_step_by_step(odd_data, episode,
     np.testing.assert_allclose(found, wanted, rtol=2e-4)
 
 
-@pytest.mark.parametrize("ratio", [1e-3, 1.0, 1e6])
-def test_the_loss_equals_batch_regression_in_float64(ratio):
-    rng = np.random.default_rng(0)
-    features = rng.normal(size=(30, 6)) * np.geomspace(1.0, 1e-2, 6)
-    residual = np.einsum("ti,iko->tko", features, rng.normal(size=(6, 2, 3)))
-    residual += 0.05 * rng.normal(size=residual.shape)
-    learned, judged = np.arange(30) < 12, (np.arange(30) >= 12) & (np.arange(30) < 25)
-    first = features[learned]
-    covariance = np.linalg.inv(first.T @ first + np.eye(6) / ratio)
+def twin(features, residual, learned, judged, ratio):
+    """The loss by batch regression, in float64."""
+    first, size = features[learned], features.shape[1]
+    covariance = np.linalg.inv(first.T @ first + np.eye(size) / ratio)
     weight = np.einsum("ij,tj,tko->iko", covariance, first, residual[learned])
     error = np.square(residual - np.einsum("ti,iko->tko", features, weight))[judged]
     spread = 1.0 + np.einsum("ti,ij,tj->t", features, covariance, features)[judged]
     noise = (error / spread[:, None, None]).mean(0)
-    wanted = np.log(np.maximum(noise, MIN_NOISE)).mean() + np.log(spread).mean()
-    single = [jnp.asarray(x, jnp.float32) for x in (features, residual)]
-    known, asked, none = (jnp.asarray(x) for x in (learned, judged, np.zeros(30, bool)))
-    loss = jax.jit(functools.partial(loss_after_learning, *single))
-    assert loss(known, asked, jnp.asarray(ratio, jnp.float32)) == pytest.approx(wanted, abs=2e-3)
-    assert loss(known, none, jnp.asarray(ratio, jnp.float32)) == 0.0
+    return np.log(np.maximum(noise, MIN_NOISE)).mean() + np.log(spread).mean()
+
+
+@pytest.mark.parametrize("ratio", [1e-3, 1.0, 1e6])
+def test_the_loss_and_its_gradient_equal_batch_regression_in_float64(ratio):
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(30, 6)) * np.geomspace(1.0, 1e-2, 6)
+    residual = np.einsum("ti,iko->tko", features, rng.normal(size=(6, 2, 3)))
+    residual += 0.05 * rng.normal(size=residual.shape)
+    moved = [rng.normal(size=x.shape) * np.abs(x).mean() for x in (features, residual)]
+    steps = np.arange(30)
+    learned, judged = steps < 12, (steps >= 12) & (steps < 25)
+
+    def wanted(shift):
+        args = (x + shift * by for x, by in zip((features, residual), moved, strict=True))
+        return twin(*args, learned, judged, ratio)
+
+    def found(shift, judged):
+        args = (x + shift * by for x, by in zip((features, residual), moved, strict=True))
+        args = [jnp.asarray(x, jnp.float32) for x in args]
+        return loss_after_learning(*args, jnp.asarray(learned), judged, jnp.float32(ratio))
+
+    loss, slope = jax.jit(jax.value_and_grad(found))(jnp.float32(0), jnp.asarray(judged))
+    assert loss == pytest.approx(wanted(0.0), abs=2e-3)
+    assert slope == pytest.approx((wanted(1e-5) - wanted(-1e-5)) / 2e-5, rel=5e-3)
+    assert found(0.0, jnp.zeros(30, bool)) == 0.0
 
 
 @eqx.filter_jit

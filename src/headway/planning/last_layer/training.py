@@ -5,16 +5,16 @@ has learned, in closed form, from what the episode has shown: the first n transi
 training episode are learned from as `regression` does while acting, and all later ones are
 judged. Its gradient goes through the regression into the features.
 
-- **The later transitions**, not just the next one: a plan imagines many steps. They see the context of
-  moment n, as a plan made then would.
+- **The later transitions**, not just the next one: a plan imagines many steps. They see the
+  context of moment n, as a plan made then would.
 - **n is log-uniform**, because the posterior changes most in the beginning.
 - **Two heads per task**, the one that explains the episode best and the second best. The first is
   what acts on known physics; the second imitates physics that no head was made for, with no data
   but those of training.
 - **Heads are held fixed** in this loss: the ordinary loss goes on beside it and alone decides what
   each head is made for. Else the second-best head would be drawn to the physics of the best.
-- **The noise variance is the most likely one** of each task, head and dimension. So tasks count by how
-  much better they become, not by how large their errors are.
+- **The noise variance is the most likely one** of each task, head and dimension. So tasks count
+  by how much better they become, not by how large their errors are.
 
 ALPaCA (Harrison et al., 2018) trains features through the same regression, for one network
 without heads.
@@ -137,14 +137,36 @@ def loss_after_learning(
         judged: Transitions to predict then.
         ratio: Of the prior (ρ).
     """
-    weight, triangle = posterior(features, residual, learned, ratio)
-    error = residual - jnp.einsum("ti,iko->tko", features, weight)
-    projected = solve_triangular(triangle, features.T, trans="T")
-    spread = 1.0 + jnp.square(projected).sum(0)
+    error, spread = errors_after_learning(features, residual, learned, ratio)
     share = judged / jnp.maximum(judged.sum(), 1)
     noise = jnp.einsum("t,tko->ko", share / spread, jnp.square(error))
     loss = jnp.log(jnp.maximum(noise, MIN_NOISE)).mean() + (share * jnp.log(spread)).sum()
     return jnp.where(judged.any(), loss, 0.0)
+
+
+def errors_after_learning(
+    features: Float[Array, "time feature"],
+    residual: Float[Array, "time rank obs"],
+    learned: Bool[Array, " time"],
+    ratio: Float[Array, ""],
+) -> tuple[Float[Array, "time rank obs"], Float[Array, " time"]]:
+    """What is left of all residuals after learning, and their predictive variance 1 + φᵀPφ.
+
+    The variance is in units of that of the noise. Both are differentiated implicitly, with what
+    `posterior` found held fixed: w solves Φᵀ(r − Φw) = w/ρ, and φᵀPφ is the largest value of
+    2φᵀz − |Φz|² − |z|²/ρ, which is at z = Pφ. The derivative of the QR decomposition would take
+    ten times as long.
+    """
+    weight, root = jax.lax.stop_gradient(posterior(features, residual, learned, ratio))
+    rows = jnp.where(learned[:, None], features, 0.0)
+    remains = residual - jnp.einsum("ti,iko->tko", rows, weight)
+    balance = jnp.einsum("ti,tko->iko", rows, remains)
+    weight = weight + jnp.einsum("ij,lj,lko->iko", root, root, _only_gradient(balance))
+    projected = jax.lax.stop_gradient(features) @ root
+    best = projected @ root.T
+    value = 2.0 * (features * best).sum(-1) - jnp.square(best @ rows.T).sum(-1)
+    spread = 1.0 + jnp.square(projected).sum(-1) + _only_gradient(value)
+    return residual - jnp.einsum("ti,iko->tko", features, weight), spread
 
 
 def posterior(
@@ -159,12 +181,16 @@ def posterior(
     prior in float32 where the ratio is large.
 
     Returns:
-        The mean of the corrections, and R with P = (RᵀR)⁻¹.
+        The mean of the corrections, and S with P = S Sᵀ.
     """
     size = features.shape[-1]
     rows = jnp.where(learned[:, None], features, 0.0)
     orthogonal, triangle = jnp.linalg.qr(jnp.concatenate([rows, jnp.eye(size) / jnp.sqrt(ratio)]))
+    root = solve_triangular(triangle, jnp.eye(size))
     known = jnp.where(learned[:, None, None], residual, 0.0)
-    projected = jnp.einsum("ti,tko->iko", orthogonal[: len(rows)], known)
-    flat = solve_triangular(triangle, projected.reshape(size, -1))
-    return flat.reshape(projected.shape), triangle
+    return jnp.einsum("ij,tj,tko->iko", root, orthogonal[: len(rows)], known), root
+
+
+def _only_gradient(values: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Zero, with the gradient of the values."""
+    return values - jax.lax.stop_gradient(values)
