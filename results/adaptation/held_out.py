@@ -67,10 +67,10 @@ def of_moment(
     residual = training.of_best_heads(seen, steps < episodes.length[moment.episode])
 
     def of_rank(features, residual, ratio):
-        weight, _ = training.posterior(features, residual[:, None], learned, ratio)
-        error = jnp.square(residual - features @ weight[:, 0]).mean(-1)
-        nll = training.loss_after_learning(features, residual[:, None], learned, judged, ratio)
-        return (error * judged).sum() / judged.sum(), nll
+        what = features, residual[:, None]
+        left, _ = training.errors_after_learning(*what, moment.step, ratio)
+        nll = training.loss_after_learning(*what, moment.step, judged, ratio)
+        return (jnp.square(left).mean((1, 2)) * judged).sum() / judged.sum(), nll
 
     of_member = jax.vmap(of_rank, in_axes=(None, 1, None))
     return jax.vmap(of_member, in_axes=(1, 1, 0))(seen.features, residual, loss.ratio)

@@ -121,7 +121,7 @@ def test_the_loss_and_its_gradient_equal_batch_regression_in_float64(ratio):
     def found(shift, judged):
         args = (x + shift * by for x, by in zip((features, residual), moved, strict=True))
         args = [jnp.asarray(x, jnp.float32) for x in args]
-        return loss_after_learning(*args, jnp.asarray(learned), judged, jnp.float32(ratio))
+        return loss_after_learning(*args, jnp.asarray(12), judged, jnp.float32(ratio))
 
     loss, slope = jax.jit(jax.value_and_grad(found))(jnp.float32(0), jnp.asarray(judged))
     assert loss == pytest.approx(wanted(0.0), abs=2e-3)

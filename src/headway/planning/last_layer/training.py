@@ -3,7 +3,7 @@
 An ordinary fit asks how well a head predicts. The loss here asks how well it predicts once it
 has learned, in closed form, from what the episode has shown: the first n transitions of a
 training episode are learned from as `regression` does while acting, and all later ones are
-judged. Its gradient goes through the regression into the features.
+judged. Its gradient goes through what was learned into the features.
 
 - **The later transitions**, not just the next one: a plan imagines many steps. They see the
   context of moment n, as a plan made then would.
@@ -26,13 +26,20 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from headway.models.dynamics import MultiHeadDynamics
 from headway.models.fitting import FitData, FitSetup
 from headway.planning.last_layer.prior import MIN_NOISE
-from headway.planning.last_layer.regression import Seen, see_episode
+from headway.planning.last_layer.regression import (
+    LastLayer,
+    Observed,
+    Prior,
+    Seen,
+    forecast,
+    see_episode,
+    update,
+)
 from headway.tasks.base import Task
 
 STEP = 0.1
@@ -94,7 +101,7 @@ class AdaptationLoss(eqx.Module):
         )
         residual = of_best_heads(seen, learned | judged)
         loss = jax.vmap(loss_after_learning, in_axes=(1, 1, None, None, 0))
-        return loss(seen.features, residual, learned, judged, self.ratio)
+        return loss(seen.features, residual, moment.step, judged, self.ratio)
 
 
 def with_fixed_heads(model: MultiHeadDynamics) -> MultiHeadDynamics:
@@ -121,11 +128,11 @@ def of_best_heads(
 def loss_after_learning(
     features: Float[Array, "time feature"],
     residual: Float[Array, "time rank obs"],
-    learned: Bool[Array, " time"],
+    learned: Int[Array, ""],
     judged: Bool[Array, " time"],
     ratio: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """Gaussian NLL of some transitions after others were learned from.
+    """Gaussian NLL of some transitions after earlier ones were learned from.
 
     In the units of `losses.negative_log_likelihood`: averaged over transitions, dimensions and
     heads, twice the log-density, without constants. 0 where there is nothing to judge.
@@ -133,7 +140,7 @@ def loss_after_learning(
     Args:
         features: What the heads see.
         residual: What they leave unexplained.
-        learned: Transitions to learn from.
+        learned: How many transitions are learned from (n), from the first one on.
         judged: Transitions to predict then.
         ratio: Of the prior (ρ).
     """
@@ -147,21 +154,21 @@ def loss_after_learning(
 def errors_after_learning(
     features: Float[Array, "time feature"],
     residual: Float[Array, "time rank obs"],
-    learned: Bool[Array, " time"],
+    learned: Int[Array, ""],
     ratio: Float[Array, ""],
 ) -> tuple[Float[Array, "time rank obs"], Float[Array, " time"]]:
     """What is left of all residuals after learning, and their predictive variance 1 + φᵀPφ.
 
     The variance is in units of that of the noise. Both are differentiated implicitly, with what
-    `posterior` found held fixed: w solves Φᵀ(r − Φw) = w/ρ, and φᵀPφ is the largest value of
-    2φᵀz − |Φz|² − |z|²/ρ, which is at z = Pφ. The derivative of the QR decomposition would take
-    ten times as long.
+    the filter found held fixed: w solves Φᵀ(r − Φw) = w/ρ, and φᵀPφ is the largest value of
+    2φᵀz − |Φz|² − |z|²/ρ, which is at z = Pφ. So no gradient goes back through the filter's steps.
     """
-    weight, root = jax.lax.stop_gradient(posterior(features, residual, learned, ratio))
-    rows = jnp.where(learned[:, None], features, 0.0)
+    weight, root = jax.lax.stop_gradient(learn_first(features, residual, learned, ratio))
+    rows = jnp.where(jnp.arange(len(features))[:, None] < learned, features, 0.0)
     remains = residual - jnp.einsum("ti,iko->tko", rows, weight)
     balance = jnp.einsum("ti,tko->iko", rows, remains)
-    weight = weight + jnp.einsum("ij,lj,lko->iko", root, root, _only_gradient(balance))
+    change = jnp.einsum("ji,jko->iko", root, _only_gradient(balance))
+    weight = weight + jnp.einsum("ij,jko->iko", root, change)
     projected = jax.lax.stop_gradient(features) @ root
     best = projected @ root.T
     value = 2.0 * (features * best).sum(-1) - jnp.square(best @ rows.T).sum(-1)
@@ -169,26 +176,31 @@ def errors_after_learning(
     return residual - jnp.einsum("ti,iko->tko", features, weight), spread
 
 
-def posterior(
+def learn_first(
     features: Float[Array, "time feature"],
     residual: Float[Array, "time rank obs"],
-    learned: Bool[Array, " time"],
+    learned: Int[Array, ""],
     ratio: Float[Array, ""],
 ) -> tuple[Float[Array, "feature rank obs"], Float[Array, "feature feature"]]:
-    """What `regression.update` comes to after some transitions, all at once.
+    """Learn from the first transitions of an episode, as an agent does, one by one.
 
-    By a QR decomposition of the features over the prior, because the normal equations lose the
-    prior in float32 where the ratio is large.
+    No decomposition at once instead: batched calls of LAPACK can wait for each other forever in
+    jaxlib 0.10 on two cores.
 
     Returns:
         The mean of the corrections, and S with P = S Sᵀ.
     """
-    size = features.shape[-1]
-    rows = jnp.where(learned[:, None], features, 0.0)
-    orthogonal, triangle = jnp.linalg.qr(jnp.concatenate([rows, jnp.eye(size) / jnp.sqrt(ratio)]))
-    root = solve_triangular(triangle, jnp.eye(size))
-    known = jnp.where(learned[:, None, None], residual, 0.0)
-    return jnp.einsum("ij,tj,tko->iko", root, orthogonal[: len(rows)], known), root
+    _, ranks, obs_size = residual.shape
+    size, one = features.shape[-1], jnp.ones((1, 1, 1))
+    prior = Prior(ratio[None], jnp.ones((1, obs_size)), jnp.zeros(1))
+
+    def learn(step, layer):
+        observed = Observed(features[None, None, step], residual[None, None, step], one)
+        return update(layer, observed, forecast(layer, observed))
+
+    start = LastLayer.of_prior(prior, 1, (ranks, size, obs_size))
+    layer = jax.lax.fori_loop(0, learned, learn, start)
+    return layer.weight[0, 0].transpose(1, 0, 2), layer.root[0, 0, 0]
 
 
 def _only_gradient(values: Float[Array, "..."]) -> Float[Array, "..."]:
