@@ -1,10 +1,10 @@
 """Train a finished run for adaptation, without training it again.
 
-    python results/adaptation/go_on.py RUN NEW_RUN --epochs 20
+    python results/adaptation/go_on.py RUN NEW_RUN --epochs 10
 
 NEW_RUN is what the run would have become with `fitting.adaptation_epochs`, but untested: these
 epochs follow the last fit, so everything before them is copied. On one and the same machine the
-networks are those of `headway train ... --fitting.adaptation-epochs 20`, to the bit.
+networks are those of `headway train ... --fitting.adaptation-epochs 10`, to the bit.
 """
 
 import argparse

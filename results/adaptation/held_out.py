@@ -1,6 +1,6 @@
 """How well heads predict after they have learned, on training physics that the run never saw.
 
-    python results/adaptation/held_out.py RUN --others OTHER_SEED ... --epochs 20 --table NAME.csv
+    python results/adaptation/held_out.py RUN --others OTHER_SEED ... --epochs 10 --table NAME.csv
 
 Goes on from a finished run with epochs of training for adaptation, exactly as the run would have
 with `fitting.adaptation_epochs`, and measures before and after each some. What is held out are the
