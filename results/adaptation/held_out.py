@@ -41,9 +41,9 @@ COLUMNS = ("run", "loss", "step", "epoch", "rank", "learned_from", "rmse", "nll"
 class Held(NamedTuple):
     """Errors after learning, averaged over members and held-out episodes."""
 
-    rmse: jax.Array
+    rmse: np.ndarray
     """[moment, rank]; root of the mean squared error, normalised."""
-    nll: jax.Array
+    nll: np.ndarray
     """[moment, rank]; the loss that is trained for, but of the next transitions only."""
 
 

@@ -270,6 +270,15 @@ def update(
     return kept, (jnp.where(finite, loss, 0.0), jnp.where(finite, forward, 0.0), ~finite)
 
 
+def of_update(
+    extra: ExtraLoss | None, data: FitData, key: PRNGKeyArray, number: Int[Array, ""]
+) -> Callable[[MultiHeadDynamics], Float[Array, ""]] | None:
+    """What an extra term, if there is one, asks of the model in one update."""
+    if extra is None:
+        return None
+    return lambda model: extra(model, data, jax.random.fold_in(key, number))
+
+
 @jit_networks
 def fit_epoch(
     state: FitState,
@@ -304,9 +313,7 @@ def fit_epoch(
             (i * size + jnp.arange(size) < data.samples.count).astype(jnp.float32), chunk.shape
         )
         batch, owners = gather_batch(data, assignment, chunk, weight, setup)
-        more = None
-        if extra is not None:
-            more = functools.partial(extra, data=data, key=jax.random.fold_in(key, i))
+        more = of_update(extra, data, key, i)
         state, (one_loss, one_forward, bad) = update(state, setup, data, batch, owners, more)
         return state, loss + one_loss, forward + one_forward, skipped + bad
 
