@@ -123,7 +123,8 @@ def add(
                 raise SystemExit(f"{place} was measured with {old['settings']}; use a new table.")
             return
     own = RunDir(run).config()
-    if groups is None and override(own, settings) == own:
+    tested = RunDir(run).evaluation()
+    if tested and groups is None and override(own, settings) == own:
         parts = tested_in_training(run)
     else:
         parts = measure(run, settings, groups)

@@ -106,6 +106,8 @@ def test_what_a_method_can_use_separates_runs():
     assert not separates("tmcl", "planner.num_elites", **mppi)
     assert separates("tmcl", "planner.warm_min_std", **warm)
     assert not separates("tmcl", "planner.warm_min_std", **warm, **mppi)
+    assert separates("pets", "fitting.adaptation_epochs")
+    assert not separates("grbal", "fitting.adaptation_epochs")
     assert separates("tmcl", "fitting.segment_length")
     assert not separates("mcl", "fitting.segment_length")
     assert separates("mcl", "fitting.warmup_iterations")

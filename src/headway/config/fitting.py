@@ -58,6 +58,10 @@ class FittingConfig:
     RIA does. The time of an update grows with it."""
     drop_first_anchor: bool = False
     """Whether the first anchor of every trajectory is left out (a defect of the released code)."""
+    adaptation_epochs: int = 0
+    """Passes over the data after the last iteration's fit, in which the networks also learn to be
+    adapted: features are trained for what heads predict of the rest of an episode once they have
+    learned from its beginning, as with `planner.adaptation`."""
 
     def __post_init__(self):
         problems = Problems(self)
@@ -66,6 +70,7 @@ class FittingConfig:
         problems.at_least(
             0,
             "warmup_iterations",
+            "adaptation_epochs",
             "max_rollbacks",
             "backward_weight",
             "logvar_bound_weight",

@@ -118,6 +118,7 @@ _USED_WHEN: tuple[tuple[Callable[[Config], bool], tuple[str, ...]], ...] = (
             "fitting.oracle",
             "fitting.logvar_bound_weight",
             "fitting.weight_decay",
+            "fitting.adaptation_epochs",
             "planner.head_selection",
             "planner.selection_error",
             "planner.selection_skips_newest",

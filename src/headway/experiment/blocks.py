@@ -25,7 +25,15 @@ from headway.config import Config, FittingConfig
 from headway.data import Episodes, Samples, Trajectory
 from headway.experiment.methods import told_sim_params
 from headway.models.dynamics import Statistics
-from headway.models.fitting import EpochStats, FitData, FitSetup, FitState, fit_epoch, make_data
+from headway.models.fitting import (
+    EpochStats,
+    ExtraLoss,
+    FitData,
+    FitSetup,
+    FitState,
+    fit_epoch,
+    make_data,
+)
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
@@ -166,7 +174,12 @@ class BlockedData:
 
 
 def fit_blocks(
-    state: FitState, setup: FitSetup, blocks: Iterable[Block], *, independent: bool
+    state: FitState,
+    setup: FitSetup,
+    blocks: Iterable[Block],
+    *,
+    independent: bool,
+    extra: ExtraLoss | None = None,
 ) -> tuple[FitState, EpochStats]:
     """Fit one block after the other.
 
@@ -175,13 +188,14 @@ def fit_blocks(
         setup: Task and settings.
         blocks: Those of one epoch.
         independent: Train every head on all samples.
+        extra: Another term of what is minimised.
 
     Returns:
         The new state, and averages over all updates.
     """
 
     def fit(state: FitState, data: FitData, key: PRNGKeyArray) -> tuple[FitState, EpochStats]:
-        return fit_epoch(state, setup, data, independent=independent, key=key)
+        return fit_epoch(state, setup, data, independent=independent, key=key, extra=extra)
 
     return fit_each(state, blocks, fit)
 

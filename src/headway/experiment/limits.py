@@ -86,7 +86,7 @@ def memory_need(config: Config, task: Task, episode_length: int) -> MemoryNeed:
         PROCESS,
         16 * FLOAT * num_parameters(config, task),
         episodes + table + rows,
-        6 * rows + _batch(config, task) + _assignment(config, task, episode_length),
+        6 * rows + _batch(config, task, episode_length) + _assignment(config, task, episode_length),
         _planning(config, task),
         workers * WORKER,
     )
@@ -121,15 +121,20 @@ def _dense(sizes: tuple[int, ...]) -> int:
     return sum((n + 1) * m for n, m in itertools.pairwise(sizes))
 
 
-def _batch(config: Config, task: Task) -> int:
-    """Activations of one update, kept for the gradient; a recurrent network's in every step."""
+def _batch(config: Config, task: Task, episode_length: int) -> int:
+    """Activations of one update, kept for the gradient; a recurrent network's in every step.
+
+    In training for adaptation an update also looks at an episode.
+    """
     model = config.model
     if model.kind == "recurrent":
         return FLOAT * config.fitting.batch_size * 12 * sum(model.hidden_sizes)
     heads = 2 * model.num_heads * (model.hidden_sizes[-1] + 3 * task.obs_size)
     widths = 3 * (sum(model.hidden_sizes) + sum(model.context_hidden_sizes)) + heads
     nets = 2 if model.backward_net else 1
-    of_batch = nets * model.num_members * config.fitting.batch_size * widths
+    rows = config.fitting.batch_size
+    rows += episode_length if config.fitting.adaptation_epochs else 0
+    of_batch = nets * model.num_members * rows * widths
     return FLOAT * (of_batch + _relation(config, task))
 
 

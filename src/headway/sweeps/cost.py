@@ -85,8 +85,12 @@ def run_flop(config: Config, first_iteration: int = 0) -> float:
         with_train = last or config.evaluation.training_group == "always"
         groups = num_unseen + with_train if tested else 0
         steps += groups * config.evaluation.num_episodes * length
-        passes = config.fitting.epochs * (iteration + 1) * collected
-        total += steps * per_step + passes * config.fitting.future_length * per_sample
+        samples = (iteration + 1) * collected * config.fitting.future_length
+        passes = config.fitting.epochs
+        if last and config.model.kind == "multi-headed":
+            # Every update also looks at an episode.
+            passes += config.fitting.adaptation_epochs * (1 + length / config.fitting.batch_size)
+        total += steps * per_step + passes * samples * per_sample
     return total
 
 

@@ -11,15 +11,16 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from headway.data import Episodes, Trajectory
-from headway.experiment.blocks import BlockedData, Layout, fit_blocks
+from headway.experiment.blocks import Block, BlockedData, Layout, fit_blocks
 from headway.experiment.diagnostics import head_shares, prediction_error
 from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
 from headway.experiment.methods import told_sim_params
 from headway.experiment.rollouts import Arena
 from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.models.fitting import FitSetup, FitState, episode_losses
+from headway.models.fitting import EpochStats, FitSetup, FitState, episode_losses
 from headway.planning.agent import Agent
 from headway.planning.last_layer.prior import fit_prior
+from headway.planning.last_layer.training import AdaptationLoss, for_adaptation
 
 
 class MultiHeaded(Learner):
@@ -57,14 +58,41 @@ class MultiHeaded(Learner):
             or model.num_heads == 1
         )
 
+        def go_through(
+            blocks: Iterable[Block], state: FitState, epoch: int
+        ) -> tuple[FitState, EpochStats]:
+            if epoch < fitting.epochs:
+                return fit_blocks(state, self.setup, blocks, independent=independent)
+            setup = for_adaptation(self.setup)
+            if epoch == fitting.epochs:
+                state = setup.init(state.model)  # Adam begins anew: it minimises something else
+            loss = self.adaptation_loss(Learned(state, statistics), trajectories)
+            return fit_blocks(state, setup, blocks, independent=independent, extra=loss)
+
         def epochs(state: FitState, first: int) -> Epochs:
-            with closing(data.stream(fitting.epochs, epoch_key, first=first)) as blocks:
-                for _ in range(first, fitting.epochs):
+            last = self.num_epochs(iteration)
+            with closing(data.stream(last, epoch_key, first=first)) as blocks:
+                for epoch in range(first, last):
                     of_epoch = itertools.islice(blocks, data.num_blocks)
-                    state, stats = fit_blocks(state, self.setup, of_epoch, independent=independent)
+                    state, stats = go_through(of_epoch, state, epoch)
                     yield state, stats
 
         return Fit(statistics, epochs)
+
+    def num_epochs(self, iteration: int) -> int:
+        """See `Learner.num_epochs`."""
+        last = iteration == self.config.collection.num_iterations - 1
+        return self.config.fitting.epochs + last * self.config.fitting.adaptation_epochs
+
+    def adaptation_loss(
+        self, learned: Learned, trajectories: Sequence[Trajectory]
+    ) -> AdaptationLoss:
+        """The loss after learning, under the prior that the model of the moment asks for."""
+        length = self.config.model.history_length
+        prior = fit_prior(
+            learned.fit.model, self.task, learned.statistics, trajectories, history_length=length
+        )
+        return AdaptationLoss(self.task, length, prior.ratio)
 
     def agent(
         self,

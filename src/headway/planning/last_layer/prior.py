@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 
 from headway.data import Episodes, Trajectory
 from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.planning.last_layer.regression import MAX_LOG_NOISE, Prior, Seen
+from headway.planning.last_layer.regression import MAX_LOG_NOISE, Prior, Seen, see_episode
 from headway.tasks.base import Task
 
 RATIOS = np.geomspace(1e-7, 1e7, 281)
@@ -180,16 +180,8 @@ def _look(
     history_length: int,
 ) -> Seen:
     """All transitions of an episode, each with the context of the moment after it."""
-    steps = jnp.arange(episode.action.shape[1])
-    history = episode.history(jnp.zeros_like(steps), steps + 1, history_length)
-    members = model.num_members
-    told = jnp.broadcast_to(episode.sim_params[0], (len(steps), episode.sim_params.shape[1]))
-    history, told = jax.tree.map(
-        lambda x: jnp.broadcast_to(x, (members, *x.shape)), (history, told)
-    )
-    context = model.context(history, statistics, told)
-    transition = (episode.obs[0, :-1], episode.action[0], episode.obs[0, 1:])
-    return Seen.through(model, task, statistics, transition, context)
+    moments = jnp.arange(episode.action.shape[1]) + 1
+    return see_episode(model, task, statistics, episode, 0, moments, history_length)
 
 
 def _spread(count: int, most: int) -> list[int]:

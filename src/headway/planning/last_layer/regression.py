@@ -20,9 +20,11 @@ Potter's square-root filter (Maybeck, 1979, section 7.3).
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from headway.data import Episodes
 from headway.models.dynamics import MultiHeadDynamics, Statistics, network_input
 from headway.tasks.base import Task
 
@@ -87,6 +89,38 @@ class Seen(NamedTuple):
         features = jnp.concatenate([head_input, one], axis=-1).transpose(1, 0, 2)
         residual = target - mean
         return cls(features, residual.transpose(2, 0, 1, 3), logvar)
+
+
+def see_episode(
+    model: MultiHeadDynamics,
+    task: Task,
+    statistics: Statistics,
+    episodes: Episodes,
+    row: int | Int[Array, ""],
+    moments: Int[Array, " time"],
+    history_length: int,
+) -> Seen:
+    """All transitions of an episode; what is `env` in `Seen` is time here.
+
+    Args:
+        model: The dynamics model.
+        task: How observations enter and leave it.
+        statistics: The normalisers in use.
+        episodes: Padded episodes.
+        row: Which of them.
+        moments: For each transition, the step of whose past its context is made.
+        history_length: Past transitions that a context is made of (K).
+    """
+    history = episodes.history(jnp.full_like(moments, row), moments, history_length)
+    told = episodes.sim_params[row]
+    told = jnp.broadcast_to(told, (len(moments), len(told)))
+    history, told = jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (model.num_members, *x.shape)), (history, told)
+    )
+    context = model.context(history, statistics, told)
+    obs = episodes.obs[row]
+    transition = obs[:-1], episodes.action[row], obs[1:]
+    return Seen.through(model, task, statistics, transition, context)
 
 
 class Observed(NamedTuple):
