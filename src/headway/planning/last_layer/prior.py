@@ -10,7 +10,7 @@ member under which the residuals of all training episodes are most likely (type-
 likelihood; MacKay, 1992). σ² has a closed form for every ρ, so only ρ is searched for.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
+from threadpoolctl import threadpool_limits
 
 from headway.data import Episodes, Trajectory
 from headway.models.dynamics import MultiHeadDynamics, Statistics
@@ -125,16 +126,10 @@ def fit_prior(
             seen = jax.tree.map(lambda x, s=steps: np.asarray(x[s]), found)
             yield [_of_member(seen, member, rank) for member in members]
 
-    references = _mean_logvar(looks())
-    used = references if head_noise else [None] * len(members)
-    parts = [[*map(_reduced, episode, used)] for episode in looks()]
-    priors = []
-    for member in members:
-        evidence = Evidence.joined([episode[member] for episode in parts])
-        ratio = evidence.best_ratio()
-        priors.append((ratio, evidence.noise(ratio), references[member]))
-    columns = (np.stack(column) for column in zip(*priors, strict=True))
-    return Prior(*(jnp.asarray(column, jnp.float32) for column in columns))
+    # Small matrices, one after the other: BLAS threads only wait for each other, and for long
+    # where the cores have other work too.
+    with threadpool_limits(1, user_api="blas"):
+        return _most_likely(looks, len(members), head_noise=head_noise)
 
 
 class _OfMember(NamedTuple):
@@ -154,6 +149,22 @@ def _of_member(seen: Seen, member: int, rank: Rank) -> _OfMember:
     if seen.logvar is not None:
         logvar = np.asarray(seen.logvar[:, member, head], np.float64).mean(-1)
     return _OfMember(np.asarray(seen.features[:, member], np.float64), residual[:, head], logvar)
+
+
+def _most_likely(
+    looks: Callable[[], Iterator[list[_OfMember]]], num_members: int, *, head_noise: bool
+) -> Prior:
+    """The prior of every member, in two looks at the episodes."""
+    references = _mean_logvar(looks())
+    used = references if head_noise else [None] * num_members
+    parts = [[*map(_reduced, episode, used)] for episode in looks()]
+    priors = []
+    for member in range(num_members):
+        evidence = Evidence.joined([episode[member] for episode in parts])
+        ratio = evidence.best_ratio()
+        priors.append((ratio, evidence.noise(ratio), references[member]))
+    columns = (np.stack(column) for column in zip(*priors, strict=True))
+    return Prior(*(jnp.asarray(column, jnp.float32) for column in columns))
 
 
 def _mean_logvar(episodes: Iterable[list[_OfMember]]) -> list[float]:
