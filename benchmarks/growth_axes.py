@@ -14,7 +14,7 @@ from headway.models.compilation import compiler_options, jit_networks
 from headway.models.dynamics import Statistics
 from headway.models.fitting import assign_segments, fit_epoch, make_data
 from headway.models.meeting import Program, stack
-from headway.planning.agent import _act
+from headway.planning.step import _act
 from headway.tasks.catalog import env_spec
 
 MODEL = ModelConfig(

@@ -229,13 +229,41 @@ def test_a_controller_holds_to_the_last_plan_where_a_sensor_fails():
     jax.tree.map(np.testing.assert_array_equal, controller._state.memory, memory)
 
 
-@pytest.mark.parametrize("method", ["grbal", "rebal", "random"])
-def test_a_method_that_has_no_deadline_is_named(method):
-    kind = {"grbal": "gradient", "rebal": "recurrent"}.get(method)
-    agent = AdaptiveAgent(model_of(kind), TASK, PLANNER) if kind else RandomAgent(TASK)
-    with pytest.raises(ConfigError, match=f"is 50, but {method} cannot .*allowed: None"):
-        Controller(agent, deadline_ms=50.0)
-    assert method in METHODS
+@pytest.mark.parametrize("kind", ["gradient", "recurrent"])
+def test_a_deadline_that_is_long_enough_changes_nothing(kind):
+    agent = AdaptiveAgent(model_of(kind), TASK, PLANNER)
+    plain, timed = Controller(agent), Controller(agent, deadline_ms=1e6)
+    for step in range(3):
+        obs = np.array([0.1 * step, -0.2])
+        np.testing.assert_allclose(timed.act(obs), plain.act(obs), atol=1e-5)
+    assert timed.status is not None
+    assert timed.status.outcome == "planned"
+
+
+def test_a_search_that_runs_out_of_time_is_cut_off(monkeypatch):
+    controller = Controller(AdaptiveAgent(model_of("recurrent"), TASK, PLANNER), deadline_ms=1e6)
+    assert controller._deadline is not None
+    monkeypatch.setattr(controller._deadline, "_fits", lambda until: False)
+    controller.act(np.zeros(2))
+    assert controller.status is not None
+    assert (controller.status.outcome, controller.status.iterations) == ("deadline", 1)
+    controller.act(np.zeros(2))
+    assert controller.status.outcome == "held"
+
+
+def test_an_agent_that_makes_no_plan_has_no_deadline():
+    with pytest.raises(ConfigError, match=r"is 50, but random makes no plan .*allowed: None"):
+        Controller(RandomAgent(TASK), deadline_ms=50.0)
+    assert "random" in METHODS
+
+
+@pytest.mark.parametrize("kind", ["gradient", "recurrent"])
+def test_observations_unlike_the_training_data_are_named(kind):
+    controller = Controller(AdaptiveAgent(model_of(kind), TASK, PLANNER))
+    controller.act(np.full(2, 1e4))
+    assert controller.status is not None
+    assert controller.status.outcome == "planned"
+    assert controller.status.warnings
 
 
 def test_an_iteration_that_failed_is_no_failed_plan():

@@ -3,6 +3,7 @@
 import dataclasses
 import resource
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +17,8 @@ from headway.planning import agent as agent_module
 from headway.planning.agent import Agent
 from headway.planning.controller import Controller
 from headway.planning.deadline import DeadlinePlanner
+from headway.planning.optimizers import make_optimizer
+from headway.planning.step import scoring
 
 TINY = PlannerConfig(
     horizon=4,
@@ -116,9 +119,9 @@ def test_a_search_that_is_cut_off_answers_with_the_best_so_far():
     work = Work(agent, 5.6)
     outcome = work.planner.act(state, OBS[None], work.now)
     # The same draws, those of the first two of four iterations, by hand.
-    prepared = jax.jit(agent_module.prepare)(agent, state, jnp.asarray(OBS[None]))
-    score = agent_module.scoring(agent, prepared.dynamics, jnp.asarray(OBS[None]))
-    optimizer = agent_module.make_optimizer(agent.planner)
+    prepared = eqx.filter_jit(agent.prepare)(state, jnp.asarray(OBS[None]))
+    score = scoring(agent, prepared.dynamics, jnp.asarray(OBS[None]))
+    optimizer = make_optimizer(agent.planner)
     search = optimizer.begin(state.search)
     for key in jax.random.split(prepared.plan_key, 4)[:2]:
         search = jax.jit(lambda search, key: optimizer.iterate(score, search, key))(search, key)

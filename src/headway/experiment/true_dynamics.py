@@ -22,11 +22,11 @@ from headway.envs.vector_worlds import ClassicVectorEnv, RolloutVectorEnv
 from headway.errors import ConfigError
 from headway.experiment.rollouts import Arena
 from headway.planning.acting import Physics
-from headway.planning.agent import Decision
 from headway.planning.controller import env_action
 from headway.planning.imagination import over_rows
 from headway.planning.optimizers import Plan, SearchState, make_optimizer
 from headway.planning.returns import RolloutSettings, candidate_returns
+from headway.planning.step import Decision
 from headway.tasks.base import Task
 
 

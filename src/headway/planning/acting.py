@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from headway.planning.agent import Decision
+from headway.planning.step import Decision
 from headway.tasks.base import Task
 
 Physics = Sequence[Mapping[str, float]]

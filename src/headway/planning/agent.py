@@ -1,7 +1,7 @@
 """An agent: recent history, head selection, and a planner around a dynamics model."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,7 +12,6 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from headway.config import PlannerConfig
 from headway.data import sim_params_row
 from headway.errors import ConfigError
-from headway.models.compilation import jit_networks
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.planning.devices import whole_on_each
 from headway.planning.heads import RecentTransitions, head_errors, select_heads
@@ -26,8 +25,8 @@ from headway.planning.last_layer.learning import (
     learn,
 )
 from headway.planning.last_layer.regression import Prior
-from headway.planning.optimizers import Plan, Score, SearchState, make_optimizer, where_env
-from headway.planning.returns import RolloutSettings, candidate_returns
+from headway.planning.optimizers import Plan, SearchState, make_optimizer, where_env
+from headway.planning.step import Decision, act
 from headway.tasks.base import Task
 
 
@@ -44,20 +43,6 @@ class AgentState(NamedTuple):
     """What the heads learned in this episode."""
     sim_params: Float[Array, "env sim_param"] | None = None
     """The true simulator parameters, for a model that is told them."""
-
-
-class Decision(NamedTuple):
-    """What an agent decided in one step."""
-
-    action: Float[Array, "env action"]
-    """The action to take, in [-1, 1]."""
-    heads: Int[Array, "env member"] | None
-    """The head each member plans with; with `average`, the one that would be adaptive. None
-    where a model has no heads."""
-    failures: Int[Array, " env"]
-    """Planner iterations without any finite return."""
-    evaluations: Int[Array, " env"]
-    """Candidates whose return was imagined, each with `num_particles` rollouts."""
 
 
 class Agent(eqx.Module):
@@ -126,8 +111,44 @@ class Agent(eqx.Module):
         self, state: AgentState, obs: Float[Array | np.ndarray, "env obs"]
     ) -> tuple[AgentState, Decision]:
         """Choose the next action of every environment (paper, section 3.3)."""
-        act = _act_bfloat16 if self.planner.precision == "bfloat16" else _act_float32
         return act(self, state, jnp.asarray(obs, jnp.float32))
+
+    def prepare(self, state: AgentState, obs: Float[Array, "env obs"]) -> "Prepared":
+        """See `Planning.prepare`."""
+        key, head_key, error_key, plan_key = jax.random.split(state.key, 4)
+        # 1. Remember the transition that the last action caused.
+        recent = state.recent.push(state.obs, state.action, obs, state.acted)
+        # 2. Encode the recent past, once per member, for the whole plan.
+        context = encode(self, recent, state.sim_params)
+        # 3. Learn from that transition, where anything keeps learning.
+        learned = learn(self, state.learned, recent, context, state.acted)
+        # 4. Choose the head that best explains the recent past.
+        heads = choose_heads(
+            self, recent, context, error_key=error_key, head_key=head_key, learned=learned
+        )
+        chosen, layer = planning_heads(self, heads), learned.layer
+        dynamics = ImaginedDynamics.fold(
+            self.model,
+            self.statistics,
+            chosen,
+            context,
+            precision=self.planner.precision,
+            correction=None if layer is None else layer.weight,
+            doubt=None if layer is None else doubt(self, layer, chosen, context),
+        )
+        return Prepared(recent, learned, heads, dynamics, key, plan_key)
+
+    def decide(
+        self, state: AgentState, obs: Float[Array, "env obs"], prepared: "Prepared", plan: Plan
+    ) -> tuple[AgentState, Decision]:
+        """See `Planning.decide`."""
+        recent, learned, heads, _, key, _ = prepared
+        action = plan.actions[:, 0]
+        acted = jnp.ones_like(state.acted)
+        search = make_optimizer(self.planner).shift(plan.state)
+        state = AgentState(recent, obs, action, acted, search, key, learned, state.sim_params)
+        decision = Decision(action, heads, plan.failures, plan.evaluations)
+        return whole_on_each((state, decision), self.planner.devices)
 
 
 class Prepared(NamedTuple):
@@ -139,70 +160,6 @@ class Prepared(NamedTuple):
     dynamics: ImaginedDynamics
     key: PRNGKeyArray
     plan_key: PRNGKeyArray
-
-
-def prepare(agent: Agent, state: AgentState, obs: Float[Array, "env obs"]) -> Prepared:
-    """Everything of a step that comes before its search."""
-    key, head_key, error_key, plan_key = jax.random.split(state.key, 4)
-    # 1. Remember the transition that the last action caused.
-    recent = state.recent.push(state.obs, state.action, obs, state.acted)
-    # 2. Encode the recent past, once per member, for the whole plan.
-    context = encode(agent, recent, state.sim_params)
-    # 3. Learn from that transition, where anything keeps learning.
-    learned = learn(agent, state.learned, recent, context, state.acted)
-    # 4. Choose the head that best explains the recent past.
-    heads = choose_heads(
-        agent, recent, context, error_key=error_key, head_key=head_key, learned=learned
-    )
-    chosen, layer = planning_heads(agent, heads), learned.layer
-    dynamics = ImaginedDynamics.fold(
-        agent.model,
-        agent.statistics,
-        chosen,
-        context,
-        precision=agent.planner.precision,
-        correction=None if layer is None else layer.weight,
-        doubt=None if layer is None else doubt(agent, layer, chosen, context),
-    )
-    return Prepared(recent, learned, heads, dynamics, key, plan_key)
-
-
-def scoring(agent: Agent, dynamics: ImaginedDynamics, obs: Float[Array, "env obs"]) -> Score:
-    """Returns of candidates, imagined from where each environment is now."""
-    settings = RolloutSettings.of(agent.planner, agent.model.num_members)
-
-    def score(candidates, key):
-        return candidate_returns(dynamics, agent.task, obs, candidates, settings=settings, key=key)
-
-    return score
-
-
-def decide(
-    agent: Agent, state: AgentState, obs: Float[Array, "env obs"], prepared: Prepared, plan: Plan
-) -> tuple[AgentState, Decision]:
-    """Take a plan's first action; where its search ended, one step later, is the next start."""
-    recent, learned, heads, _, key, _ = prepared
-    action = plan.actions[:, 0]
-    acted = jnp.ones_like(state.acted)
-    search = make_optimizer(agent.planner).shift(plan.state)
-    state = AgentState(recent, obs, action, acted, search, key, learned, state.sim_params)
-    decision = Decision(action, heads, plan.failures, plan.evaluations)
-    return whole_on_each((state, decision), agent.planner.devices)
-
-
-def _act(
-    agent: Agent, state: AgentState, obs: Float[Array, "env obs"]
-) -> tuple[AgentState, Decision]:
-    prepared = prepare(agent, state, obs)
-    # Imagine candidates, and search for the best action sequence.
-    score = scoring(agent, prepared.dynamics, obs)
-    optimizer = make_optimizer(agent.planner)
-    plan = optimizer.optimize(score, state.search, key=prepared.plan_key)
-    return decide(agent, state, obs, prepared, plan)
-
-
-_act_float32 = jit_networks(_act)
-_act_bfloat16 = jit_networks(_act, precision="bfloat16")
 
 
 def encode(
@@ -261,18 +218,3 @@ def reset_where(state: AgentState, fresh: AgentState, done: Bool[Array, " env"])
     """Forget everything about the environments where an episode begins anew."""
     kept = where_env(done, fresh._replace(key=None), state._replace(key=None))
     return kept._replace(key=state.key)
-
-
-def hold(planner: PlannerConfig, state: Any) -> Any:
-    """Go on along the last plan without a look: its next action is the state's `action`.
-
-    The plan is what the search's distribution was centred on in the end. The transition that the
-    action causes is not remembered, because it begins unseen.
-
-    Args:
-        planner: What made the plan.
-        state: An `AgentState`, or that of another agent that plans.
-    """
-    search = make_optimizer(planner).shift(state.search)
-    unseen = jnp.zeros_like(state.acted)
-    return state._replace(action=state.search.guess[:, 0], acted=unseen, search=search)

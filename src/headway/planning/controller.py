@@ -13,10 +13,11 @@ from numpy.typing import ArrayLike
 
 from headway.config import PlannerConfig
 from headway.errors import ConfigError, PlanningError
+from headway.models.dynamics import Statistics
 from headway.planning.acting import Acting
-from headway.planning.agent import Agent, hold
 from headway.planning.checking import RangeCheck, in_bounds, not_finite, one_row
 from headway.planning.deadline import DeadlinePlanner
+from headway.planning.step import Planning, hold
 from headway.tasks.base import Task
 
 
@@ -84,8 +85,9 @@ class Controller:
         self.agent = agent
         self._seed, self._episode = seed, -1
         self._range = self._deadline = None
-        if isinstance(agent, Agent) and max_deviations is not None:
-            self._range = RangeCheck(agent.task, agent.statistics.features, max_deviations)
+        statistics: Statistics | None = getattr(agent, "statistics", None)
+        if statistics is not None and max_deviations is not None:
+            self._range = RangeCheck(agent.task, statistics.features, max_deviations)
         if deadline_ms is not None:
             self._deadline = self._planner_to(deadline_ms)
             self._rehearse(self._deadline)
@@ -185,11 +187,11 @@ class Controller:
             raise ConfigError(
                 f"deadline_ms is {deadline_ms}, allowed: milliseconds above 0, or None for none."
             )
-        if not isinstance(self.agent, Agent):
+        if not isinstance(self.agent, Planning):
             name = getattr(self.agent, "method", type(self.agent).__name__)
             raise ConfigError(
-                f"deadline_ms is {deadline_ms:g}, but {name} cannot be cut off in the middle of a"
-                " plan, allowed: None; or take a method that can, such as tmcl or pets."
+                f"deadline_ms is {deadline_ms:g}, but {name} makes no plan that could be cut"
+                " off, allowed: None; or take a method that plans, such as tmcl or pets."
             )
         return DeadlinePlanner(self.agent, deadline_ms / 1000)
 

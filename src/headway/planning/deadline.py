@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from headway.errors import ConfigError
 from headway.models.compilation import jit_networks
-from headway.planning.agent import Agent, AgentState, Decision, Prepared, decide, prepare, scoring
 from headway.planning.optimizers import make_optimizer
+from headway.planning.step import Decision, Planning, scoring
 
 REMEMBERED = 32
 """Calls whose durations are remembered."""
@@ -28,7 +28,7 @@ REMEMBERED = 32
 class Outcome(NamedTuple):
     """A step that was planned until a deadline."""
 
-    state: AgentState
+    state: Any
     decision: Decision
     iterations: int
     """Iterations that were begun, and ended."""
@@ -50,7 +50,7 @@ class DeadlinePlanner:
     """
 
     def __init__(
-        self, agent: Agent, seconds: float, clock: Callable[[], float] = time.perf_counter
+        self, agent: Planning, seconds: float, clock: Callable[[], float] = time.perf_counter
     ):
         if agent.planner.devices != "local":
             raise ConfigError(
@@ -75,7 +75,7 @@ class DeadlinePlanner:
 
     def act(
         self,
-        state: AgentState,
+        state: Any,
         obs: Float[np.ndarray, "1 obs"],
         started: float,
         at_least: int = 0,
@@ -124,17 +124,17 @@ class DeadlinePlanner:
 
 
 def _begin(
-    agent: Agent, state: AgentState, obs: Float[Array, "env obs"]
-) -> tuple[Prepared, list[PRNGKeyArray], Any]:
-    prepared = prepare(agent, state, obs)
+    agent: Planning, state: Any, obs: Float[Array, "env obs"]
+) -> tuple[Any, list[PRNGKeyArray], Any]:
+    prepared = agent.prepare(state, obs)
     optimizer = make_optimizer(agent.planner)
     keys = jax.random.split(prepared.plan_key, optimizer.num_iterations)
     return prepared, list(keys), optimizer.begin(state.search)
 
 
 def _iterate(
-    agent: Agent,
-    prepared: Prepared,
+    agent: Planning,
+    prepared: Any,
     obs: Float[Array, "env obs"],
     search: Any,
     key: PRNGKeyArray,
@@ -147,10 +147,10 @@ def _iterate(
 
 
 def _end(
-    agent: Agent, state: AgentState, obs: Float[Array, "env obs"], prepared: Prepared, search: Any
-) -> tuple[AgentState, Decision]:
+    agent: Planning, state: Any, obs: Float[Array, "env obs"], prepared: Any, search: Any
+) -> tuple[Any, Decision]:
     plan = make_optimizer(agent.planner).end(search)
-    return decide(agent, state, obs, prepared, plan)
+    return agent.decide(state, obs, prepared, plan)
 
 
 _COMPILED = {

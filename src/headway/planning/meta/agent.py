@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from headway.config import PlannerConfig
-from headway.models.compilation import jit_networks
+from headway.models.dynamics import Statistics
 from headway.planning.acting import Physics
-from headway.planning.agent import Decision
 from headway.planning.heads import RecentTransitions
 from headway.planning.meta.models import AdaptiveModel, Transition
-from headway.planning.optimizers import SearchState, make_optimizer
-from headway.planning.returns import RolloutSettings, candidate_returns, follow
+from headway.planning.optimizers import Plan, SearchState, make_optimizer
+from headway.planning.returns import Dynamics, follow
+from headway.planning.step import Decision, act
 from headway.tasks.base import Task
 
 
@@ -38,6 +38,11 @@ class AdaptiveAgent(eqx.Module):
     task: Task
     planner: PlannerConfig = eqx.field(static=True)
     sim_param_names = ()
+
+    @property
+    def statistics(self) -> Statistics | None:
+        """Normalisers of the training data; None for a model that has none."""
+        return getattr(self.model, "statistics", None)
 
     @property
     def method(self) -> str:
@@ -63,37 +68,34 @@ class AdaptiveAgent(eqx.Module):
         self, state: AdaptiveState, obs: Float[Array | np.ndarray, "env obs"]
     ) -> tuple[AdaptiveState, Decision]:
         """See `Acting.act`."""
-        act = _act_bfloat16 if self.planner.precision == "bfloat16" else _act_float32
         return act(self, state, jnp.asarray(obs, jnp.float32))
 
+    def prepare(self, state: AdaptiveState, obs: Float[Array, "env obs"]) -> "Prepared":
+        """See `Planning.prepare`: learn from the transition that the last action caused."""
+        key, plan_key = jax.random.split(state.key)
+        seen = Transition(state.obs, state.action, obs, state.acted)
+        memory = self.model.remember(state.memory, seen)
+        dynamics = self.model.dynamics(memory, self.planner.precision)
+        return Prepared(memory, dynamics, key, plan_key)
 
-def _act(
-    agent: AdaptiveAgent, state: AdaptiveState, obs: Float[Array, "env obs"]
-) -> tuple[AdaptiveState, Decision]:
-    key, plan_key = jax.random.split(state.key)
-    # 1. Learn from the transition that the last action caused.
-    memory = agent.model.remember(
-        state.memory, Transition(state.obs, state.action, obs, state.acted)
-    )
-    # 2. Imagine candidates with what the model is now, and search for the best sequence.
-    dynamics = agent.model.dynamics(memory, agent.planner.precision)
-    settings = RolloutSettings.of(agent.planner, dynamics.num_members)
-
-    def score(candidates, key):
-        return candidate_returns(dynamics, agent.task, obs, candidates, settings=settings, key=key)
-
-    optimizer = make_optimizer(agent.planner)
-    plan = optimizer.optimize(score, state.search, key=plan_key)
-    # 3. Take the first action; where the search ended, one step later, is the next start.
-    action = plan.actions[:, 0]
-    acted = jnp.ones_like(state.acted)
-    search = optimizer.shift(plan.state)
-    decision = Decision(action, None, plan.failures, plan.evaluations)
-    return AdaptiveState(memory, obs, action, acted, search, key), decision
+    def decide(
+        self, state: AdaptiveState, obs: Float[Array, "env obs"], prepared: "Prepared", plan: Plan
+    ) -> tuple[AdaptiveState, Decision]:
+        """See `Planning.decide`."""
+        action = plan.actions[:, 0]
+        acted = jnp.ones_like(state.acted)
+        search = make_optimizer(self.planner).shift(plan.state)
+        decision = Decision(action, None, plan.failures, plan.evaluations)
+        return AdaptiveState(prepared.memory, obs, action, acted, search, prepared.key), decision
 
 
-_act_float32 = jit_networks(_act)
-_act_bfloat16 = jit_networks(_act, precision="bfloat16")
+class Prepared(NamedTuple):
+    """All that is known in a step before its search."""
+
+    memory: Any
+    dynamics: Dynamics
+    key: PRNGKeyArray
+    plan_key: PRNGKeyArray
 
 
 @eqx.filter_jit
