@@ -1,9 +1,11 @@
+import io
 import json
 
 import matplotlib
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from headway.errors import RunError
 from headway.experiment.methods import make_config
@@ -11,7 +13,7 @@ from headway.report.dynamics import Changes, choose_views, collect_changes
 from headway.report.figures import save_run_figures
 from headway.report.obs_names import obs_names
 from headway.report.physics import axis_label, distinct, full_label, varying
-from headway.report.tables import by_group, by_physics, envs
+from headway.report.tables import by_group, by_physics, envs, evaluation
 from headway.storage.tables import EpisodeRow
 from headway.tasks.catalog import env_spec
 
@@ -98,6 +100,17 @@ def test_a_group_score_counts_each_physics_once():
     assert by_group(rows, config)[0]["score"] == pytest.approx(0.5)
     rows.append(row(9.0, 0.0))
     assert by_group(rows, config)[0]["score"] is None
+
+
+def test_brackets_in_names_are_no_markup():
+    physics = {"length": 0.5, "mass": 1.0}
+    rows = [EpisodeRow("tmcl", "pendulum", 0, 0, "[/x]", physics, 0, -126.0, 200)]
+    table = evaluation(rows, make_config("pendulum"), "runs/[/x][bold]")
+    console = Console(width=120, file=io.StringIO(), record=True)
+    console.print(table)
+    text = console.export_text()
+    assert "runs/[/x][bold]" in text
+    assert "unseen: [/x]" in text
 
 
 def test_scores_are_of_the_protocol_not_of_the_episodes_that_survived():

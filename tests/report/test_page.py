@@ -1,6 +1,7 @@
 """The report's page: what it says, what it survives, and that it needs nothing else."""
 
 import csv
+import dataclasses
 import html
 import io
 import json
@@ -14,6 +15,7 @@ import pytest
 import headway
 from headway.cli import main
 from headway.errors import ConfigError, RunError, UnknownNameError
+from headway.report.page import svg
 from headway.report.page.build import SECTIONS, write_report
 from headway.report.page.contexts import principal_components, variance_between
 from headway.report.page.runs import load_runs, train_command
@@ -263,10 +265,34 @@ def test_colours_follow_the_theme(tmp_path):
     assert len(used) == len(physics) > 1
 
 
-def test_a_method_without_a_model_has_no_contexts(tmp_path):
+def test_a_method_without_a_model_has_every_chapter(tmp_path):
     run = headway.train("pendulum", method="random", preset="smoke", run_dir=tmp_path / "run")
-    page = write_report([run.path], tmp_path / "report.html", only=["contexts"]).read_text()
+    page = write_report([run.path], tmp_path / "report.html").read_text()
+    assert re.findall(r'<section id="([\w-]+)">', page) == list(SECTIONS)
     assert "No learned context: random, seed 0." in page
+
+
+def test_episodes_shorter_than_the_history_have_no_contexts(tmp_path, monkeypatch):
+    short = [
+        dataclasses.replace(t, obs=t.obs[:11], action=t.action[:10], reward=t.reward[:10])
+        for t in RunDir(SAMPLE).load_data()
+    ]
+    monkeypatch.setattr(RunDir, "load_data", lambda self: short)
+    page = write_report([SAMPLE], tmp_path / "report.html", only=["contexts"]).read_text()
+    assert f"{SAMPLE} has no contexts to show: none of its collected episodes is" in text_of(page)
+
+
+def test_only_coordinates_are_shortened():
+    def draw(axes):
+        axes.plot([0.0, 1 / 3], [0.0, 1.0])
+        axes.set_xticks([0.0005, 0.375], ["0.0005", 'x="0.375"'])
+
+    drawn = svg.panel(draw, name="a", label="learning rate 0.00025")
+    assert 'aria-label="learning rate 0.00025"' in drawn
+    texts = map(html.unescape, re.findall(r"<text[^>]*>(.*?)</text>", drawn))
+    assert {"0.0005", 'x="0.375"'} <= set(texts)
+    assert re.search(r' d="M \d+\.\d', drawn)
+    assert not re.search(r' (?:d|x|y|transform)="[^"<>]*\.\d\d\d', drawn)
 
 
 def test_principal_components():

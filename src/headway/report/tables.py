@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from rich import box
 from rich.table import Table
+from rich.text import Text
 
 from headway.config import Config
 from headway.experiment.methods import METHODS, PRESETS
@@ -177,10 +178,23 @@ def _settings(settings: Mapping[str, Any]) -> str:
     return "\n".join(f"{name} {value}" for name, value in settings.items()) or "–"
 
 
-def new_table(title: str, *columns: str) -> Table:
-    """An empty table in the look of all others."""
-    table = Table(
-        *columns, title=title, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD
+class TextTable(Table):
+    """A table whose texts are shown as they are: what is in brackets is no markup."""
+
+    def add_row(self, *cells: Any, **look: Any) -> None:
+        """Add a line of cells; strings are plain text."""
+        plain = [Text(cell) if isinstance(cell, str) else cell for cell in cells]
+        super().add_row(*plain, **look)
+
+
+def new_table(title: str, *columns: str) -> TextTable:
+    """An empty table in the look of all others; its texts are shown as they are."""
+    table = TextTable(
+        *columns,
+        title=Text(title, "bold"),
+        title_justify="left",
+        caption_justify="left",
+        box=box.SIMPLE_HEAD,
     )
-    table.title_style, table.caption_style = "bold", "dim"
+    table.caption_style = "dim"
     return table

@@ -137,7 +137,8 @@ def _returns(run: LoadedRun, group: str) -> dict[int, tuple[float, float]]:
     """Steps and mean return by iteration."""
     found = {}
     for row in run.metrics:
-        summary = row["collection"] if group == COLLECTED else row.get("evaluation", {}).get(group)
+        tables = row if group == COLLECTED else row.get("evaluation", {})
+        summary = tables.get("collection" if group == COLLECTED else group)
         if summary is not None:
             found[row["iteration"]] = row["timesteps"], summary["return_mean"]
     return found

@@ -56,6 +56,9 @@ THEME = {
 """Variables of the style sheet: their value in light and in dark."""
 
 _VARIABLES = {light.lower(): f"var(--{name})" for name, (light, _) in THEME.items()}
+_COORDINATES = re.compile(
+    r' (?:d|points|transform|[xy][12]?|c[xy]|r|width|height)="[^"]*"'  # attributes that hold them
+)
 _SETTINGS: dict[Any, Any] = {
     "svg.fonttype": "none",
     "text.parse_math": False,  # a dollar is a dollar
@@ -107,9 +110,14 @@ def _inline(document: str, name: str, label: str) -> str:
     svg = re.sub(r' id="([^"]+)"', lambda match: match[0] if match[1] in wanted else "", svg)
     svg = re.sub(r"<style.*?</style>", "", svg, flags=re.DOTALL)  # the page has it
     svg = re.sub(r" font-family: [^;\"]*;", "", svg)
-    svg = re.sub(r"(\d\.\d\d)\d+", r"\1", svg)
+    svg = re.sub(r"<\w[^<>]*>", _trimmed, svg)
     return re.sub(r"\s*\n\s*", "\n", svg).strip()
 
 
 def _themed(match: re.Match[str]) -> str:
     return f"{match[1]}: {_VARIABLES.get(match[2], match[2])}"
+
+
+def _trimmed(tag: re.Match[str]) -> str:
+    """A tag whose coordinates have two decimals; what is written for readers stays as it is."""
+    return _COORDINATES.sub(lambda found: re.sub(r"(\d\.\d\d)\d+", r"\1", found[0]), tag[0])
