@@ -124,6 +124,21 @@ def test_what_learns_nothing_is_a_level_beside_curves(tmp_path):
     assert list(curve.get_xdata()) == [20, 40, 60]
 
 
+def test_an_episode_that_was_cut_bends_no_curve(tmp_path):
+    points = [
+        Point("pendulum", "T-MCL", seed, i, 20 * i + 20 - 6 * (seed == i == 1), 10.0 * i + 2 * seed)
+        for seed in range(3)
+        for i in range(3)
+    ]
+    axes = Figure().subplots()
+    _curves(axes, Found(comparison(tmp_path), [], points, []), "pendulum")
+    (curve,) = axes.get_lines()
+    assert list(curve.get_xdata()) == [20, 38, 60]
+    assert list(curve.get_ydata()) == [2, 12, 22]
+    edges = axes.collections[0].get_paths()[0].vertices
+    assert {float(y) for x, y in edges if x == 38} == {10.0, 14.0}  # one standard deviation
+
+
 def test_training_curves_show_what_was_collected(training, tmp_path):
     done = reproduce(comparison(tmp_path, "fig9", seeds=(0,)), workers=HERE)
     rows = rows_of(tmp_path / "fig9-smoke/fig9.csv")

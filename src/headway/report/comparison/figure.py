@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
@@ -62,6 +63,28 @@ def arm_styles(labels: Sequence[str]) -> dict[str, tuple[str, LineStyle]]:
     }
 
 
+def seed_curves(
+    points: Sequence[Point],
+) -> tuple[Float[np.ndarray, " iteration"], Float[np.ndarray, "seed iteration"]]:
+    """The curves of an arm, iteration by iteration: seeds differ in steps where an episode was cut.
+
+    Args:
+        points: What the runs of one arm measured in one environment.
+
+    Returns:
+        Environment steps, mean over seeds, and every seed's returns, at the iterations that all
+        seeds were measured after.
+    """
+    runs: dict[int, dict[int, tuple[int, float]]] = {}
+    for point in points:
+        runs.setdefault(point.seed, {})[point.iteration] = point.timesteps, point.value
+    if not runs:
+        return np.zeros(0), np.zeros((0, 0))
+    common = sorted(set.intersection(*(set(run) for run in runs.values())))
+    table = np.array([[run[i] for i in common] for run in runs.values()]).reshape(len(runs), -1, 2)
+    return table[..., 0].mean(0), table[..., 1]
+
+
 def _labels(found: Found) -> list[str]:
     return [arm.label for arm in found.comparison.experiment.arms]
 
@@ -77,15 +100,15 @@ def _handles(found: Found) -> list[Line2D]:
 def _curves(axes: Axes, found: Found, env: str) -> None:
     """Mean over seeds, with a band of one standard deviation where there are several."""
     for label, (color, line) in arm_styles(_labels(found)).items():
-        points = found.of(env, label)
-        steps = sorted({point.timesteps for point in points})
-        by_step = [[p.value for p in points if p.timesteps == step] for step in steps]
-        mean = np.array([np.mean(values) for values in by_step])
-        if steps == [0]:  # nothing is learned
+        steps, returns = seed_curves(found.of(env, label))
+        if not len(steps):
+            continue
+        mean = returns.mean(0)
+        if not steps.any():  # nothing is learned
             axes.axhline(mean[0], color=color, linestyle=line, linewidth=1.2)
             continue
-        if any(len(values) > 1 for values in by_step):
-            std = np.array([np.std(values, ddof=len(values) > 1) for values in by_step])
+        if len(returns) > 1:
+            std = returns.std(0, ddof=1)
             axes.fill_between(steps, mean - std, mean + std, color=color, alpha=0.13, linewidth=0)
         axes.plot(steps, mean, color=color, linestyle=line, marker="o", markersize=3)
     axes.set_xlim(left=0)
