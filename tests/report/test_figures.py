@@ -97,7 +97,10 @@ def test_a_group_score_counts_each_physics_once():
     config = make_config("pendulum")
     rows = [row(0.5, -126.0), row(1.0, -1143.0), row(1.0, -1143.0)]
     assert [part["episodes"] for part in by_physics(rows, config)] == [1, 2]
-    assert by_group(rows, config)[0]["score"] == pytest.approx(0.5)
+    (group,) = by_group(rows, config)
+    assert group["score"] == pytest.approx(0.5)
+    assert (group["episodes"], group["return_mean"]) == (3, (-126 - 1143) / 2)
+    assert group["return_std"] == pytest.approx((1143 - 126) / 2)
     rows.append(row(9.0, 0.0))
     assert by_group(rows, config)[0]["score"] is None
 

@@ -18,6 +18,7 @@ from headway.errors import ConfigError, RunError, UnknownNameError
 from headway.report.page import svg
 from headway.report.page.build import SECTIONS, write_report
 from headway.report.page.contexts import principal_components, variance_between
+from headway.report.page.measures import improvements_of
 from headway.report.page.runs import load_runs, train_command
 from headway.report.page.series import Comparison, series_labels
 from headway.report.page.svg import THEME
@@ -84,8 +85,8 @@ def test_the_page_holds_every_chapter_and_needs_nothing_else(folder, tmp_path):
 def test_raw_numbers_are_those_of_the_runs(folder, tmp_path):
     page = write_report([folder], tmp_path / "report.html", only=["numbers"]).read_text()
     rows = numbers(page)
-    assert {row["method"] for row in rows} == {"tmcl", "pets"}
-    assert len(rows) == 2 * 3 * 8
+    assert {row["method"] for row in rows} == {"tmcl", "pets", "random", "true-dynamics"}
+    assert len(rows) == 4 * 3 * 8
     row = next(r for r in rows if (r["method"], r["seed"]) == ("pets", "1"))
 
     def mean(method, seed):
@@ -100,6 +101,37 @@ def test_raw_numbers_are_those_of_the_runs(folder, tmp_path):
     assert float(row["score"]) == pytest.approx(score, abs=1e-3)
 
 
+def test_references_that_planned_otherwise_are_not_averaged(tmp_path, write_run):
+    def write(name, method, lift, horizon):
+        changed = {"planner.horizon": horizon}
+        write_run(tmp_path / name, method=method, lift=lift, settings_changed=changed)
+
+    write("random", "random", -900, 20)
+    for name, lift, horizon in (("short", 100, 10), ("long", 300, 30)):
+        write(name, "true-dynamics", lift, horizon)
+        write(f"tmcl-{name}", "tmcl", 0, horizon)
+    write("pets", "pets", 0, 20)
+    comparison = Comparison.of(*load_runs([tmp_path]))
+    scores = {label: run["low"].score for (_, label), (run,) in comparison.outcomes.items()}
+    assert scores == {
+        "tmcl, horizon 10": pytest.approx(900 / 1000),
+        "tmcl, horizon 30": pytest.approx(900 / 1200),
+        "pets": None,
+    }
+    (note,) = comparison.notes
+    assert note.run.name == "pets"
+    assert "planned in several ways" in note.text
+    runs = comparison.runs_of("pendulum")
+    assert comparison.references.level("true-dynamics", runs, "low") is None
+    assert comparison.references.level("true-dynamics", runs[:1], "low") is not None
+    page = write_report([tmp_path], tmp_path / "report.html", only=["runs", "numbers"]).read_text()
+    for name in ("random", "short", "long"):
+        assert str(tmp_path / name) in section(page, "runs")
+    assert {row["run"] for row in numbers(page)} == {
+        str(run.path) for run in load_runs([tmp_path])[0]
+    }
+
+
 def test_results_and_verdicts(folder, tmp_path):
     page = write_report(
         [folder], tmp_path / "report.html", only=["results", "improvement"]
@@ -111,7 +143,8 @@ def test_results_and_verdicts(folder, tmp_path):
     assert f"{np.mean(scores):.2f}" in results
     assert "normalised by the runs of random and true-dynamics given here" in results
     assert "fewer than 10 seeds are too narrow" in results
-    assert "tmcl is better than pets (probability of improvement 1.00" in text_of(page)
+    said = "3 seeds: too few to show that tmcl and pets differ (the clearest result has p = 0.1)"
+    assert f"{said}; tmcl is above pets in every pair of runs." in text_of(page)
 
 
 def test_the_projects_references_are_taken_where_no_run_is_one(tmp_path, write_run):
@@ -124,12 +157,32 @@ def test_the_projects_references_are_taken_where_no_run_is_one(tmp_path, write_r
     assert float(row["score"]) == pytest.approx(score, abs=1e-3)
 
 
+def test_runs_that_were_not_tested_alike_are_not_compared(tmp_path, write_run):
+    short = {"collection.episode_length": 50}
+    for method, changed in (("tmcl", {}), ("pets", {}), ("mcl", short)):
+        for seed in range(4):
+            write_run(
+                tmp_path / f"{method}-{seed}",
+                method=method,
+                seed=seed,
+                lift=-900 * (method == "pets"),
+                settings_changed=changed,
+            )
+    comparison = Comparison.of(*load_runs([tmp_path]))
+    found = improvements_of(comparison)
+    assert set(found) == {("tmcl", "pets"), ("pets", "tmcl")}
+    only = ["improvement", "results"]
+    said = text_of(write_report([tmp_path], tmp_path / "report.html", only=only).read_text())
+    assert "tmcl is better than pets (probability of improvement 1.00" in said
+    assert "options of the environment in pendulum, low; pendulum, high." in said
+
+
 def test_two_seeds_claim_nothing(tmp_path, write_run):
     for method, seed in (("tmcl", 0), ("tmcl", 1), ("pets", 0), ("pets", 1)):
         write_run(tmp_path / f"{method}-{seed}", method=method, seed=seed, lift=500 * seed)
     page = write_report([tmp_path], tmp_path / "report.html").read_text()
     said = text_of(page)
-    assert "2 seeds: too few to claim that tmcl and pets differ; at least 3" in said
+    assert "2 seeds: too few to show that tmcl and pets differ (at least 3" in said
     assert "Fewer than 3 finished seeds: tmcl on pendulum (2); pets on pendulum (2)." in said
     assert "is better than" not in said
     assert not re.search(r"<small>[−\d.]+ to", page)

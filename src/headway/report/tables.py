@@ -45,19 +45,17 @@ def by_physics(rows: Sequence[EpisodeRow], config: Config) -> list[Facts]:
 
 
 def by_group(rows: Sequence[EpisodeRow], config: Config) -> list[Facts]:
-    """Summarise test episodes for each group.
+    """Summarise test episodes for each group; every physics of it counts once.
 
-    A group's score is the mean over its physics, each counting once; it is None unless a
-    reference is known for every one of them.
+    The score is None unless a reference is known for every physics. The standard deviation is that
+    of episodes.
     """
     parts = by_physics(rows, config)
     facts = []
     for group in dict.fromkeys(row.group for row in rows):
-        scores = [part["score"] for part in parts if part["group"] == group]
-        whole = mean_score(scores)
-        facts.append(
-            {"group": group, **_returns([r for r in rows if r.group == group]), "score": whole}
-        )
+        same = [part for part in parts if part["group"] == group]
+        score = mean_score([part["score"] for part in same])
+        facts.append({"group": group, **_merged(same), "score": score})
     return facts
 
 
@@ -78,10 +76,11 @@ def evaluation(rows: Sequence[EpisodeRow], config: Config, title: str) -> Table:
                 physics = f"  {full_label(part['sim_params'], names)}"
                 table.add_row(physics, *_cells(part, with_score))
         table.add_section()
+    table.caption = (
+        "return: mean ± standard deviation over episodes; every physics of a group counts once"
+    )
     if with_score:
-        table.caption = "score: 0 = random actions, 1 = the paper's planner on the true dynamics"
-    else:
-        table.caption = "return: mean ± standard deviation over episodes"
+        table.caption += "; score: 0 = random actions, 1 = the paper's planner on the true dynamics"
     return table
 
 
@@ -163,6 +162,17 @@ def _returns(rows: Sequence[EpisodeRow]) -> Facts:
         "episodes": len(rows),
         "return_mean": float(returns.mean()),
         "return_std": float(returns.std()),
+    }
+
+
+def _merged(parts: Sequence[Facts]) -> Facts:
+    """The returns of several physics as one, whatever the number of their episodes."""
+    means = np.array([part["return_mean"] for part in parts])
+    variances = np.array([part["return_std"] for part in parts]) ** 2
+    return {
+        "episodes": sum(part["episodes"] for part in parts),
+        "return_mean": float(means.mean()),
+        "return_std": float(np.sqrt((variances + (means - means.mean()) ** 2).mean())),
     }
 
 

@@ -80,7 +80,7 @@ def spread(values: Sequence[float]) -> str:
 def _training_and_score(found: Found, env: str, arm: str) -> list[str]:
     """The last return on training physics, and the mean score of the unseen groups."""
     training, scores = [], []
-    for cell, job in found.comparison.cells.items():
+    for cell, job in found.cells.items():
         if (cell.env, cell.arm) != (env, arm) or cell in found.missing:
             continue
         last = [r for r in RunDir(job.path).evaluation() if r.iteration == job.num_iterations - 1]
@@ -98,7 +98,8 @@ def _about(found: Found) -> list[str]:
     lines = [
         f"Preset `{comparison.preset}`{changed}, seeds {seeds}. Mean ± standard deviation over"
         " seeds after the last iteration; interquartile mean with its 95 % stratified bootstrap"
-        " interval. The score is that on unseen physics: 0 is random, 1 the paper's planner on the"
+        " interval. Every physics of a group counts once. The score is that on unseen physics: 0"
+        " is random, 1 the paper's planner on the"
         " true dynamics.",
     ]
     if len(comparison.seeds) < MIN_RUNS:

@@ -8,7 +8,15 @@ from typing import Any
 from headway import settings
 from headway.experiment.methods import METHODS
 from headway.report.page.runs import LoadedRun, Note
-from headway.report.page.scoring import REFERENCES, Outcome, References, outcome
+from headway.report.page.scoring import (
+    REFERENCES,
+    Outcome,
+    Place,
+    References,
+    by_group,
+    outcome,
+    place_of,
+)
 
 _NAMES = ("env", "method", "seed", *settings.TOLERANCE)  # differ without making a variant
 _SWATCHES = 8
@@ -42,13 +50,18 @@ class Comparison:
     series: list[Series]
     references: References
     """Returns that scores are normalised with."""
+    reference_runs: list[LoadedRun]
+    """The runs that the references come from; none where they are compared like methods."""
     notes: list[Note]
 
     @classmethod
     def of(cls, runs: Sequence[LoadedRun], notes: Sequence[Note] = ()) -> "Comparison":
         """Sort runs into series."""
         references = References.of(runs)
-        compared = [run for run in runs if run.config.method not in REFERENCES] or runs
+        others = [run for run in runs if run.config.method in REFERENCES]
+        compared = [run for run in runs if run.config.method not in REFERENCES]
+        if not compared:
+            compared, others = others, []
         labels = series_labels(compared)
         order = list(METHODS)
         methods = sorted(
@@ -68,19 +81,34 @@ class Comparison:
         for run, label in zip(compared, labels, strict=True):
             found.setdefault((run.config.env, label), []).append(run)
         series = [Series(label, index) for index, label in enumerate(names)]
-        return cls(found, series, references, list(notes))
+        notes = [*notes, *references.notes(compared)]
+        return cls(found, series, references, others, notes)
 
     @functools.cached_property
-    def outcomes(self) -> dict[tuple[str, str, str], list[Outcome]]:
-        """Of every finished run, by environment, label and group, in the order of seeds."""
-        found: dict[tuple[str, str, str], list[Outcome]] = {}
+    def outcomes(self) -> dict[tuple[str, str], list[dict[str, Outcome]]]:
+        """By environment and label: of every finished run its outcomes by group."""
+        found: dict[tuple[str, str], list[dict[str, Outcome]]] = {}
+        for place, runs in self.runs.items():
+            tested = [(run, by_group(run.tests)) for run in runs if run.tests]
+            found[place] = [
+                {group: outcome(rows, self.references, run.config) for group, rows in of.items()}
+                for run, of in tested
+            ]
+        return found
+
+    @functools.cached_property
+    def tasks(self) -> dict[tuple[str, str, str], frozenset[Place]]:
+        """What was tested, by environment, label and group.
+
+        Groups of one name may have other physics, episode lengths or options of the environment.
+        """
+        found: dict[tuple[str, str, str], set[Place]] = {}
         for (env, label), runs in self.runs.items():
             for run in runs:
-                for group in dict.fromkeys(row.group for row in run.tests):
-                    rows = [row for row in run.tests if row.group == group]
-                    places = found.setdefault((env, label, group), [])
-                    places.append(outcome(rows, self.references, run.config))
-        return found
+                for row in run.tests:
+                    places = found.setdefault((env, label, row.group), set())
+                    places.add(place_of(row, run.config))
+        return {name: frozenset(places) for name, places in found.items()}
 
     @functools.cached_property
     def envs(self) -> list[str]:
@@ -100,6 +128,11 @@ class Comparison:
         """The runs of a series in an environment; of all of them by default."""
         chosen = self.series_of(env) if series is None else [series]
         return [run for one in chosen for run in self.runs.get((env, one.label), [])]
+
+    @functools.cached_property
+    def reference_labels(self) -> list[str]:
+        """How the reference runs are named, in their order."""
+        return series_labels(self.reference_runs)
 
     def label_of(self, run: LoadedRun) -> str:
         """The label of the series that a run belongs to."""
