@@ -10,7 +10,7 @@ from rich.console import Console
 from headway.errors import RunError
 from headway.experiment.methods import make_config
 from headway.report.dynamics import Changes, choose_views, collect_changes
-from headway.report.figures import save_run_figures
+from headway.report.figures import _tested, save_run_figures
 from headway.report.obs_names import obs_names
 from headway.report.physics import axis_label, distinct, full_label, varying
 from headway.report.tables import by_group, by_physics, envs, evaluation
@@ -78,6 +78,24 @@ def test_an_unseen_training_group_is_optional_in_the_metrics(run_dir):
         row.pop("evaluation")
     (run_dir / "metrics.jsonl").write_text("\n".join(map(json.dumps, rows)))
     assert save_run_figures(run_dir)[0].name == "learning_curve.png"
+
+
+def test_the_last_tests_are_found_in_one_go():
+    class Counting(EpisodeRow):
+        reads = 0
+
+        def __getattribute__(self, name):
+            Counting.reads += name == "iteration"
+            return super().__getattribute__(name)
+
+    physics = {"length": 0.5, "mass": 1.0}
+    rows = [
+        Counting("tmcl", "pendulum", 0, i // 10, "train", physics, i, -126.0, 200)
+        for i in range(100)
+    ]
+    Counting.reads = 0
+    assert _tested(rows) == "10 test episodes per group"
+    assert Counting.reads <= 3 * len(rows)
 
 
 def test_physics_are_written_for_readers():

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import headway
+from headway import settings
 from headway.cli import main
 from headway.errors import ConfigError, RunError, UnknownNameError
 from headway.report.page import svg
@@ -202,6 +203,61 @@ def test_variants_of_a_method_are_told_apart(tmp_path, write_run):
     assert "planner.horizon" in page
 
 
+def test_presets_explain_what_follows_them(tmp_path, write_run):
+    for preset, iterations in (("quick", 5), ("paper", 10)):
+        for seed in range(2):
+            changed = {
+                "preset": preset,
+                "planner.horizon": iterations,
+                "fitting.epochs": iterations,
+            }
+            write_run(
+                tmp_path / f"{preset}-{seed}",
+                seed=seed,
+                iterations=iterations,
+                settings_changed=changed,
+            )
+    runs, _ = load_runs([tmp_path])
+    assert set(series_labels(runs)) == {"tmcl, preset quick", "tmcl, preset paper"}
+    changed = {"preset": "quick", "planner.horizon": 7, "fitting.epochs": 5}
+    write_run(tmp_path / "other", settings_changed=changed)
+    runs, _ = load_runs([tmp_path])
+    assert set(series_labels(runs)) == {
+        "tmcl, preset quick, horizon 5",
+        "tmcl, preset quick, horizon 7",
+        "tmcl, preset paper, horizon 10",
+    }
+
+
+def test_labels_are_short_and_not_ambiguous(tmp_path, write_run):
+    for index, counts in enumerate([(4, 8), (8, 4)]):
+        changed = dict(
+            zip(("collection.num_episodes", "evaluation.num_episodes"), counts, strict=True)
+        )
+        write_run(tmp_path / f"{index}", settings_changed=changed)
+    runs, _ = load_runs([tmp_path])
+    assert set(series_labels(runs)) == {
+        "tmcl, collection num episodes 4, evaluation num episodes 8",
+        "tmcl, collection num episodes 8, evaluation num episodes 4",
+    }
+    for index in range(2):
+        changed = {"planner.horizon": 5, "planner.num_candidates": 90, "model.num_heads": 2 + index}
+        write_run(tmp_path / f"more{index}", settings_changed=changed)
+    labels = series_labels(load_runs([tmp_path])[0])
+    assert len(set(labels)) == 4
+    assert max(map(len, labels)) < 80
+    assert {label[-9:] for label in labels} == {f"variant {i}" for i in range(1, 5)}
+
+
+def test_copies_are_found_without_comparing_every_pair(tmp_path, write_run, monkeypatch):
+    for seed in range(6):
+        write_run(tmp_path / f"{seed}", seed=seed)
+    calls, relevant = [], settings.relevant
+    monkeypatch.setattr(settings, "relevant", lambda *c: calls.append(1) or relevant(*c))
+    runs, _ = load_runs([tmp_path])
+    assert len(calls) == len(runs) == 6
+
+
 def test_what_is_tolerated_of_an_environment_makes_no_variant(tmp_path, write_run):
     separate = {"collection.env_processes": True}
     for seed, changed in enumerate([{}, separate, {}]):
@@ -369,19 +425,34 @@ def test_variance_between_physics():
     assert variance_between(np.array([[0.0], [2.0], [2.0], [4.0]]), physics) == pytest.approx(0.5)
 
 
-def test_the_train_command_makes_the_same_configuration(tmp_path, write_run):
+@pytest.mark.parametrize("own_physics", [False, True])
+def test_the_train_command_makes_the_same_configuration(
+    tmp_path, write_run, monkeypatch, own_physics
+):
     from headway.cli.commands import parse_train
     from headway.experiment.methods import make_config
 
     changed = {"model.hidden_sizes": [32, 32], "fitting.bootstrap": True, "planner.horizon": 7,
                "model.backward_net": False}  # fmt: skip
+    if own_physics:
+        changed["sim_params"] = {
+            "train": {"length": [0.5, 0.6]},
+            "unseen": {"low": {"length": [0.25]}, "high": {"length": [1.5]}},
+        }
     write_run(tmp_path / "a", seed=4, method="mcl", settings_changed=changed)
     (run,), _ = load_runs([tmp_path / "a"])
     program, command, *words = train_command(run)
     assert (program, command) == ("headway", "train")
-    arguments, settings = parse_train(words)
+    page = write_report([tmp_path / "a"], tmp_path / "report.html", only=["runs"]).read_text()
+    written = re.search(r"sim_params.json: ({.*?})<", html.unescape(page))
+    assert (written is not None) == own_physics
+    if written:
+        monkeypatch.chdir(tmp_path)
+        Path("sim_params.json").write_text(written[1])
+    arguments, changed = parse_train(words)
     names = {"method": arguments.method, "preset": arguments.preset, "seed": arguments.seed}
-    assert make_config(arguments.env, **names, settings=settings) == run.config
+    assert make_config(arguments.env, **names, settings=changed) == run.config
+    assert arguments.run_dir == tmp_path / "a"
 
 
 def test_report_command(folder, tmp_path, capsys):

@@ -7,7 +7,7 @@ import numpy as np
 from headway.report.page import charts, svg
 from headway.report.page.measures import RAW_COLUMNS, raw_rows
 from headway.report.page.parts import Block, Cell, Line, Panel, Section, Table, identifier
-from headway.report.page.runs import LoadedRun, train_command
+from headway.report.page.runs import PHYSICS_FILE, LoadedRun, physics_file, train_command
 from headway.report.page.series import (
     Comparison,
     differing_settings,
@@ -109,9 +109,11 @@ def sources(comparison: Comparison) -> Section:
 
 def _source(run: LoadedRun, label: str, series: int | None = None) -> Line:
     done = f"{len(run.metrics)} of {run.config.collection.num_iterations}"
-    command = shlex.join(train_command(run))
+    below = [shlex.join(train_command(run))]
+    if physics := physics_file(run):
+        below.append(f"{PHYSICS_FILE}: {physics}")
     cells = [
-        Cell(str(run.path), [command], is_code=True),
+        Cell(str(run.path), below, is_code=True),
         Cell(label, is_key=series is not None),
         Cell(str(run.config.seed), is_number=True),
         Cell(done, is_number=True),

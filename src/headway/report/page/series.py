@@ -20,6 +20,7 @@ from headway.report.page.scoring import (
 
 _NAMES = ("env", "method", "seed", *settings.TOLERANCE)  # differ without making a variant
 _SWATCHES = 8
+_LABEL = 60  # letters of a series' name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,23 +144,53 @@ def series_labels(runs: Sequence[LoadedRun]) -> list[str]:
     """Name every run by its method, and by what tells variants of a method apart.
 
     A setting counts if it differs between runs of the same method in the same environment,
-    seeds aside; what only follows the environment does not.
+    seeds aside; what only follows the environment or the preset does not. Labels that would be
+    long end with a number; the page's settings say the rest.
     """
     flat = [_settings(run) for run in runs]
-    differing: dict[str, list[str]] = {}
-    for method in {run.config.method for run in runs}:
-        for env in {run.config.env for run in runs}:
-            same = [
-                values
-                for run, values in zip(runs, flat, strict=True)
-                if (run.config.method, run.config.env) == (method, env)
-            ]
-            names = differing.setdefault(method, [])
-            names += [name for name in differing_settings(same) if name not in names]
-    return [
-        ", ".join([run.config.method, *_variant(values, differing[run.config.method])])
+    names = _differing(runs, flat)
+    labels = [
+        ", ".join([run.config.method, *_variant(values, names[run.config.method])])
         for run, values in zip(runs, flat, strict=True)
     ]
+    short = {}
+    for method in names:
+        of_method = [
+            label for run, label in zip(runs, labels, strict=True) if run.config.method == method
+        ]
+        for number, label in enumerate(dict.fromkeys(of_method), 1):
+            short[label] = _shortened(label, number)
+    return [short[label] for label in labels]
+
+
+def _differing(
+    runs: Sequence[LoadedRun], flat: Sequence[Mapping[str, Any]]
+) -> dict[str, list[str]]:
+    """Names of the settings that tell variants apart, by method."""
+    places: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for run, values in zip(runs, flat, strict=True):
+        places.setdefault((run.config.method, run.config.env), []).append(values)
+    found: dict[str, list[str]] = {}
+    for (method, _), same in places.items():
+        names = found.setdefault(method, [])
+        names += [name for name in _telling(same) if name not in names]
+    return found
+
+
+def _telling(values: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Settings that differ, without those that the preset explains."""
+    presets = [
+        [table for table in values if table["preset"] == preset]
+        for preset in dict.fromkeys(table["preset"] for table in values)
+    ]
+    unexplained = {name for same in presets for name in differing_settings(same)}
+    return [n for n in differing_settings(values) if n == "preset" or n in unexplained]
+
+
+def _shortened(label: str, number: int) -> str:
+    if len(label) <= _LABEL:
+        return label
+    return f"{label[:_LABEL].rpartition(', ')[0] or label[:_LABEL]}, … variant {number}"
 
 
 def differing_settings(values: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -178,9 +209,14 @@ def _settings(run: LoadedRun) -> dict[str, Any]:
 
 
 def _variant(values: Mapping[str, Any], names: Sequence[str]) -> list[str]:
-    """Word what is special, for example `num heads 5`."""
-    return [f"{name.rpartition('.')[2].replace('_', ' ')} {value_text(values.get(name))}"
-            for name in names]  # fmt: skip
+    """Word what is special, for example `num heads 5`; sections tell equal names apart."""
+    last = [name.rpartition(".")[2] for name in names]
+    worded = []
+    for name in names:
+        parts = name.split(".")
+        shown = parts[-1:] if last.count(parts[-1]) == 1 else parts[-2:]
+        worded.append(f"{' '.join(shown).replace('_', ' ')} {value_text(values.get(name))}")
+    return worded
 
 
 def value_text(value: Any) -> str:
