@@ -15,13 +15,13 @@ from headway.cli import main
 from headway.cli.comparisons import read_seeds, read_settings
 from headway.cli.usage import UsageError
 from headway.compare import reproduce
-from headway.report.comparison.figure import _curves, arm_styles, has_curves
+from headway.report.comparison.figure import _curves, _dots, arm_styles, has_curves
 from headway.report.comparison.runs import Found, Point, _points, find
 from headway.report.comparison.verdicts import verdicts
-from headway.report.comparison.writing import spread, write_table
+from headway.report.comparison.writing import spread, table_rows, write_table
 from headway.storage.run_dir import RunDir
 from headway.sweeps import running
-from headway.sweeps.experiments import EXPERIMENTS, Arm, Experiment, experiment
+from headway.sweeps.experiments import EXPERIMENTS, Arm, Experiment, experiment, sweep_experiment
 from headway.sweeps.jobs import Cell, Comparison
 from headway.sweeps.running import Workers
 
@@ -226,8 +226,48 @@ def test_spread_is_over_seeds():
 
 
 def test_many_arms_can_be_told_apart():
-    styles = arm_styles([f"arm {i}" for i in range(20)])
-    assert len(set(styles.values())) == 20
+    for arms in ([Arm(f"arm {i}") for i in range(20)], experiment("comparison").arms):
+        styles = arm_styles(arms)
+        assert len(set(styles.values())) == len(arms)
+
+
+def test_a_method_looks_the_same_in_every_figure():
+    named = [arm_styles(experiment(name).arms) for name in ("comparison", "fig10", "fig13")]
+    for styles in named[1:]:
+        assert styles.items() <= named[0].items()
+    own = sweep_experiment("own", ["pets", "tmcl"], {})
+    assert arm_styles(own.arms).items() <= named[0].items()
+    heads = arm_styles(experiment("fig14").arms)  # of one method
+    assert len(set(heads.values())) == len(heads)
+
+
+def test_dots_stand_in_the_order_of_results_beside_their_scores(training, tmp_path):
+    changed = {"collection.num_iterations": 1, "collection.episode_length": 200}
+    found = reproduce(comparison(tmp_path, **changed), workers=HERE).found
+    axes = Figure().subplots()
+    _dots(axes, found, "pendulum")
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["T-MCL", "MCL"]
+    assert axes.get_xlabel() == "return per episode, unseen physics"
+    scores = [text.get_text() for text in axes.texts]
+    rows = table_rows(found, "pendulum")
+    assert scores == [rows[1][-1], rows[0][-1], "score"]
+    assert "–" not in scores
+    dots = [line for line in axes.get_lines() if len(line.get_xdata()) == 3]
+    assert [line.get_color() for line in dots] == [
+        arm_styles(found.comparison.experiment.arms)[name][0] for name in ("T-MCL", "MCL")
+    ]
+
+
+def test_arms_of_one_method_keep_their_order_and_titles_are_for_readers(training, tmp_path):
+    asked = comparison(tmp_path, "fig12", seeds=(0,), **{"collection.num_iterations": 1})
+    found = reproduce(asked, workers=HERE).found
+    axes = Figure().subplots()
+    _dots(axes, found, "pendulum")
+    names = [text.get_text() for text in axes.get_yticklabels()]
+    assert names == ["with context", "without context"]
+    drawn = (tmp_path / "fig12-smoke/fig12.svg").read_text()
+    assert "<!-- With and without context learning, pendulum -->" in drawn
+    assert "fig12" not in drawn
 
 
 def run(capsys, *words):

@@ -22,17 +22,11 @@ from headway.report import style
 
 PANEL = (3.5, 2.5)  # inches
 
-SWATCHES = (
-    ("#0072b2", "#5aaee8"),
-    ("#d55e00", "#f28a45"),
-    ("#009e73", "#35c79a"),
-    ("#b0578d", "#e39cc6"),
-    ("#c98a00", "#f0b93a"),
-    ("#3f3f46", "#d4d4d8"),
-    ("#4aa3d6", "#a5d8f6"),
-    ("#8a7a00", "#ded35c"),
-)
-"""Colours of series in light and dark: Okabe and Ito's hues, dark enough for lines on white."""
+_IN_DARK = (
+    "#5aaee8", "#f28a45", "#35c79a", "#e39cc6", "#f0b93a", "#d4d4d8", "#a5d8f6", "#ded35c",
+)  # fmt: skip
+SWATCHES = tuple(zip(map(str.lower, style.SERIES), _IN_DARK, strict=True))
+"""Colours of series in light and dark."""
 
 _SCALE = matplotlib.colormaps["plasma"]
 ORDERED = tuple(
