@@ -223,14 +223,14 @@ def _permutation_test(
     for env in dict.fromkeys(envs):
         tasks = [i for i, place in enumerate(envs) if place == env]
         pooled = [np.concatenate([first[i], second[i]]) for i in tasks]
-        wins = sum(0.5 + 0.5 * np.sign(x[:, None] - x[None, :]) for x in pooled)
+        wins = np.sum([0.5 + 0.5 * np.sign(x[:, None] - x[None, :]) for x in pooled], axis=0)
         tables.append((wins, len(first[tasks[0]])))
     ways = math.prod(math.comb(len(wins), count) for wins, count in tables)
     if ways <= NUM_RESAMPLES:
-        parts = [_every_way(*table) for table in tables]
+        parts = [_every_way(wins, count) for wins, count in tables]
         sums = np.array([sum(chosen) for chosen in itertools.product(*parts)])
     else:
-        sums = np.sum([_random_ways(*table, rng) for table in tables], axis=0)
+        sums = np.sum([_random_ways(wins, count, rng) for wins, count in tables], axis=0)
     distances = np.abs(sums / len(envs) - 0.5)
     as_far = int((distances >= distances[0] - 1e-12).sum())
     return as_far / len(distances), 2 / ways

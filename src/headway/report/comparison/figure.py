@@ -50,7 +50,7 @@ def draw_comparison(found: Found) -> list[Path]:
                 axes.set_title(env)
         if curves:
             for axes in panels[:, 0]:
-                axes.set_ylabel(_measure(found))
+                axes.set_ylabel(_measure(found).replace(", ", ",\n"))
             legend(drawing, _handles(found))
     return [path, path.with_suffix(".svg")]
 
