@@ -209,6 +209,9 @@ def test_seeds_are_drawn_whole_for_all_groups_of_an_environment():
     assert interval([runs, -runs], mean, envs=["a", "a"]) == (0, 0)
     low, high = interval([runs, -runs], mean, envs=["a", "b"])
     assert low < 0 < high
+    one = probability_of_improvement([runs], [runs - 0.5])
+    several = probability_of_improvement([runs] * 3, [runs - 0.5] * 3, envs="aaa")
+    assert several.interval == one.interval
     with pytest.raises(ConfigError, match="4 and 3 runs"):
         interval([runs, runs[:3]], mean, envs=["a", "a"])
 

@@ -1,7 +1,7 @@
 """The chapters of the page that show how well methods do."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from headway.report import statistics
 from headway.report.page import charts, svg
@@ -209,9 +209,15 @@ def _bars(comparison: Comparison, env: str, group: str) -> Panel | None:
         lambda axes: charts.group_bars(axes, found, label, levels),
         name=identifier("bars", env, group),
         label=f"{label} of each method on {env}, {title}",
-        size=(3.5, 2.5 if len(found) <= 4 else 2.9),
+        size=(3.5, _bars_height([series.label for series, _ in found])),
     )
     return Panel(title, drawn)
+
+
+def _bars_height(labels: Sequence[str]) -> float:
+    """Inches that leave the bars room above their names."""
+    longest = min(max(map(len, labels)), charts.TICK_LETTERS)
+    return (2.5 if len(labels) <= 4 else 2.9) + 0.03 * max(longest - 10, 0)
 
 
 def improvements(comparison: Comparison) -> Section:
