@@ -1,17 +1,19 @@
+import io
 import json
 
 import matplotlib
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from headway.errors import RunError
 from headway.experiment.methods import make_config
 from headway.report.dynamics import Changes, choose_views, collect_changes
-from headway.report.figures import save_run_figures
+from headway.report.figures import _tested, save_run_figures
 from headway.report.obs_names import obs_names
 from headway.report.physics import axis_label, distinct, full_label, varying
-from headway.report.tables import by_group, by_physics, envs
+from headway.report.tables import by_group, by_physics, envs, evaluation
 from headway.storage.tables import EpisodeRow
 from headway.tasks.catalog import env_spec
 
@@ -78,6 +80,24 @@ def test_an_unseen_training_group_is_optional_in_the_metrics(run_dir):
     assert save_run_figures(run_dir)[0].name == "learning_curve.png"
 
 
+def test_the_last_tests_are_found_in_one_go():
+    class Counting(EpisodeRow):
+        reads = 0
+
+        def __getattribute__(self, name):
+            Counting.reads += name == "iteration"
+            return super().__getattribute__(name)
+
+    physics = {"length": 0.5, "mass": 1.0}
+    rows = [
+        Counting("tmcl", "pendulum", 0, i // 10, "train", physics, i, -126.0, 200)
+        for i in range(100)
+    ]
+    Counting.reads = 0
+    assert _tested(rows) == "10 test episodes per group"
+    assert Counting.reads <= 3 * len(rows)
+
+
 def test_physics_are_written_for_readers():
     physics = [{"length": 1.5, "mass": 1.0}, {"length": 0.5, "mass": 1.0}]
     assert distinct(physics)[0]["length"] == 0.5
@@ -95,9 +115,23 @@ def test_a_group_score_counts_each_physics_once():
     config = make_config("pendulum")
     rows = [row(0.5, -126.0), row(1.0, -1143.0), row(1.0, -1143.0)]
     assert [part["episodes"] for part in by_physics(rows, config)] == [1, 2]
-    assert by_group(rows, config)[0]["score"] == pytest.approx(0.5)
+    (group,) = by_group(rows, config)
+    assert group["score"] == pytest.approx(0.5)
+    assert (group["episodes"], group["return_mean"]) == (3, (-126 - 1143) / 2)
+    assert group["return_std"] == pytest.approx((1143 - 126) / 2)
     rows.append(row(9.0, 0.0))
     assert by_group(rows, config)[0]["score"] is None
+
+
+def test_brackets_in_names_are_no_markup():
+    physics = {"length": 0.5, "mass": 1.0}
+    rows = [EpisodeRow("tmcl", "pendulum", 0, 0, "[/x]", physics, 0, -126.0, 200)]
+    table = evaluation(rows, make_config("pendulum"), "runs/[/x][bold]")
+    console = Console(width=120, file=io.StringIO(), record=True)
+    console.print(table)
+    text = console.export_text()
+    assert "runs/[/x][bold]" in text
+    assert "unseen: [/x]" in text
 
 
 def test_scores_are_of_the_protocol_not_of_the_episodes_that_survived():

@@ -1,6 +1,7 @@
 """The report's page: what it says, what it survives, and that it needs nothing else."""
 
 import csv
+import dataclasses
 import html
 import io
 import json
@@ -12,10 +13,13 @@ import numpy as np
 import pytest
 
 import headway
+from headway import settings
 from headway.cli import main
 from headway.errors import ConfigError, RunError, UnknownNameError
+from headway.report.page import svg
 from headway.report.page.build import SECTIONS, write_report
 from headway.report.page.contexts import principal_components, variance_between
+from headway.report.page.measures import improvements_of
 from headway.report.page.runs import load_runs, train_command
 from headway.report.page.series import Comparison, series_labels
 from headway.report.page.svg import THEME
@@ -82,8 +86,8 @@ def test_the_page_holds_every_chapter_and_needs_nothing_else(folder, tmp_path):
 def test_raw_numbers_are_those_of_the_runs(folder, tmp_path):
     page = write_report([folder], tmp_path / "report.html", only=["numbers"]).read_text()
     rows = numbers(page)
-    assert {row["method"] for row in rows} == {"tmcl", "pets"}
-    assert len(rows) == 2 * 3 * 8
+    assert {row["method"] for row in rows} == {"tmcl", "pets", "random", "true-dynamics"}
+    assert len(rows) == 4 * 3 * 8
     row = next(r for r in rows if (r["method"], r["seed"]) == ("pets", "1"))
 
     def mean(method, seed):
@@ -98,6 +102,37 @@ def test_raw_numbers_are_those_of_the_runs(folder, tmp_path):
     assert float(row["score"]) == pytest.approx(score, abs=1e-3)
 
 
+def test_references_that_planned_otherwise_are_not_averaged(tmp_path, write_run):
+    def write(name, method, lift, horizon):
+        changed = {"planner.horizon": horizon}
+        write_run(tmp_path / name, method=method, lift=lift, settings_changed=changed)
+
+    write("random", "random", -900, 20)
+    for name, lift, horizon in (("short", 100, 10), ("long", 300, 30)):
+        write(name, "true-dynamics", lift, horizon)
+        write(f"tmcl-{name}", "tmcl", 0, horizon)
+    write("pets", "pets", 0, 20)
+    comparison = Comparison.of(*load_runs([tmp_path]))
+    scores = {label: run["low"].score for (_, label), (run,) in comparison.outcomes.items()}
+    assert scores == {
+        "tmcl, horizon 10": pytest.approx(900 / 1000),
+        "tmcl, horizon 30": pytest.approx(900 / 1200),
+        "pets": None,
+    }
+    (note,) = comparison.notes
+    assert note.run.name == "pets"
+    assert "planned in several ways" in note.text
+    runs = comparison.runs_of("pendulum")
+    assert comparison.references.level("true-dynamics", runs, "low") is None
+    assert comparison.references.level("true-dynamics", runs[:1], "low") is not None
+    page = write_report([tmp_path], tmp_path / "report.html", only=["runs", "numbers"]).read_text()
+    for name in ("random", "short", "long"):
+        assert str(tmp_path / name) in section(page, "runs")
+    assert {row["run"] for row in numbers(page)} == {
+        str(run.path) for run in load_runs([tmp_path])[0]
+    }
+
+
 def test_results_and_verdicts(folder, tmp_path):
     page = write_report(
         [folder], tmp_path / "report.html", only=["results", "improvement"]
@@ -109,7 +144,8 @@ def test_results_and_verdicts(folder, tmp_path):
     assert f"{np.mean(scores):.2f}" in results
     assert "normalised by the runs of random and true-dynamics given here" in results
     assert "fewer than 10 seeds are too narrow" in results
-    assert "tmcl is better than pets (probability of improvement 1.00" in text_of(page)
+    said = "3 seeds: too few to show that tmcl and pets differ (the clearest result has p = 0.1)"
+    assert f"{said}; tmcl is above pets in every pair of runs." in text_of(page)
 
 
 def test_the_projects_references_are_taken_where_no_run_is_one(tmp_path, write_run):
@@ -122,12 +158,32 @@ def test_the_projects_references_are_taken_where_no_run_is_one(tmp_path, write_r
     assert float(row["score"]) == pytest.approx(score, abs=1e-3)
 
 
+def test_runs_that_were_not_tested_alike_are_not_compared(tmp_path, write_run):
+    short = {"collection.episode_length": 50}
+    for method, changed in (("tmcl", {}), ("pets", {}), ("mcl", short)):
+        for seed in range(4):
+            write_run(
+                tmp_path / f"{method}-{seed}",
+                method=method,
+                seed=seed,
+                lift=-900 * (method == "pets"),
+                settings_changed=changed,
+            )
+    comparison = Comparison.of(*load_runs([tmp_path]))
+    found = improvements_of(comparison)
+    assert set(found) == {("tmcl", "pets"), ("pets", "tmcl")}
+    only = ["improvement", "results"]
+    said = text_of(write_report([tmp_path], tmp_path / "report.html", only=only).read_text())
+    assert "tmcl is better than pets (probability of improvement 1.00" in said
+    assert "options of the environment in pendulum, low; pendulum, high." in said
+
+
 def test_two_seeds_claim_nothing(tmp_path, write_run):
     for method, seed in (("tmcl", 0), ("tmcl", 1), ("pets", 0), ("pets", 1)):
         write_run(tmp_path / f"{method}-{seed}", method=method, seed=seed, lift=500 * seed)
     page = write_report([tmp_path], tmp_path / "report.html").read_text()
     said = text_of(page)
-    assert "2 seeds: too few to claim that tmcl and pets differ; at least 3" in said
+    assert "2 seeds: too few to show that tmcl and pets differ (at least 3" in said
     assert "Fewer than 3 finished seeds: tmcl on pendulum (2); pets on pendulum (2)." in said
     assert "is better than" not in said
     assert not re.search(r"<small>[−\d.]+ to", page)
@@ -145,6 +201,61 @@ def test_variants_of_a_method_are_told_apart(tmp_path, write_run):
     page = write_report([tmp_path], tmp_path / "report.html", only=["settings"]).read_text()
     assert "model.num_heads" in page
     assert "planner.horizon" in page
+
+
+def test_presets_explain_what_follows_them(tmp_path, write_run):
+    for preset, iterations in (("quick", 5), ("paper", 10)):
+        for seed in range(2):
+            changed = {
+                "preset": preset,
+                "planner.horizon": iterations,
+                "fitting.epochs": iterations,
+            }
+            write_run(
+                tmp_path / f"{preset}-{seed}",
+                seed=seed,
+                iterations=iterations,
+                settings_changed=changed,
+            )
+    runs, _ = load_runs([tmp_path])
+    assert set(series_labels(runs)) == {"tmcl, preset quick", "tmcl, preset paper"}
+    changed = {"preset": "quick", "planner.horizon": 7, "fitting.epochs": 5}
+    write_run(tmp_path / "other", settings_changed=changed)
+    runs, _ = load_runs([tmp_path])
+    assert set(series_labels(runs)) == {
+        "tmcl, preset quick, horizon 5",
+        "tmcl, preset quick, horizon 7",
+        "tmcl, preset paper, horizon 10",
+    }
+
+
+def test_labels_are_short_and_not_ambiguous(tmp_path, write_run):
+    for index, counts in enumerate([(4, 8), (8, 4)]):
+        changed = dict(
+            zip(("collection.num_episodes", "evaluation.num_episodes"), counts, strict=True)
+        )
+        write_run(tmp_path / f"{index}", settings_changed=changed)
+    runs, _ = load_runs([tmp_path])
+    assert set(series_labels(runs)) == {
+        "tmcl, collection num episodes 4, evaluation num episodes 8",
+        "tmcl, collection num episodes 8, evaluation num episodes 4",
+    }
+    for index in range(2):
+        changed = {"planner.horizon": 5, "planner.num_candidates": 90, "model.num_heads": 2 + index}
+        write_run(tmp_path / f"more{index}", settings_changed=changed)
+    labels = series_labels(load_runs([tmp_path])[0])
+    assert len(set(labels)) == 4
+    assert max(map(len, labels)) < 80
+    assert {label[-9:] for label in labels} == {f"variant {i}" for i in range(1, 5)}
+
+
+def test_copies_are_found_without_comparing_every_pair(tmp_path, write_run, monkeypatch):
+    for seed in range(6):
+        write_run(tmp_path / f"{seed}", seed=seed)
+    calls, relevant = [], settings.relevant
+    monkeypatch.setattr(settings, "relevant", lambda *c: calls.append(1) or relevant(*c))
+    runs, _ = load_runs([tmp_path])
+    assert len(calls) == len(runs) == 6
 
 
 def test_what_is_tolerated_of_an_environment_makes_no_variant(tmp_path, write_run):
@@ -263,10 +374,34 @@ def test_colours_follow_the_theme(tmp_path):
     assert len(used) == len(physics) > 1
 
 
-def test_a_method_without_a_model_has_no_contexts(tmp_path):
+def test_a_method_without_a_model_has_every_chapter(tmp_path):
     run = headway.train("pendulum", method="random", preset="smoke", run_dir=tmp_path / "run")
-    page = write_report([run.path], tmp_path / "report.html", only=["contexts"]).read_text()
+    page = write_report([run.path], tmp_path / "report.html").read_text()
+    assert re.findall(r'<section id="([\w-]+)">', page) == list(SECTIONS)
     assert "No learned context: random, seed 0." in page
+
+
+def test_episodes_shorter_than_the_history_have_no_contexts(tmp_path, monkeypatch):
+    short = [
+        dataclasses.replace(t, obs=t.obs[:11], action=t.action[:10], reward=t.reward[:10])
+        for t in RunDir(SAMPLE).load_data()
+    ]
+    monkeypatch.setattr(RunDir, "load_data", lambda self: short)
+    page = write_report([SAMPLE], tmp_path / "report.html", only=["contexts"]).read_text()
+    assert f"{SAMPLE} has no contexts to show: none of its collected episodes is" in text_of(page)
+
+
+def test_only_coordinates_are_shortened():
+    def draw(axes):
+        axes.plot([0.0, 1 / 3], [0.0, 1.0])
+        axes.set_xticks([0.0005, 0.375], ["0.0005", 'x="0.375"'])
+
+    drawn = svg.panel(draw, name="a", label="learning rate 0.00025")
+    assert 'aria-label="learning rate 0.00025"' in drawn
+    texts = map(html.unescape, re.findall(r"<text[^>]*>(.*?)</text>", drawn))
+    assert {"0.0005", 'x="0.375"'} <= set(texts)
+    assert re.search(r' d="M \d+\.\d', drawn)
+    assert not re.search(r' (?:d|x|y|transform)="[^"<>]*\.\d\d\d', drawn)
 
 
 def test_principal_components():
@@ -290,19 +425,34 @@ def test_variance_between_physics():
     assert variance_between(np.array([[0.0], [2.0], [2.0], [4.0]]), physics) == pytest.approx(0.5)
 
 
-def test_the_train_command_makes_the_same_configuration(tmp_path, write_run):
+@pytest.mark.parametrize("own_physics", [False, True])
+def test_the_train_command_makes_the_same_configuration(
+    tmp_path, write_run, monkeypatch, own_physics
+):
     from headway.cli.commands import parse_train
     from headway.experiment.methods import make_config
 
     changed = {"model.hidden_sizes": [32, 32], "fitting.bootstrap": True, "planner.horizon": 7,
                "model.backward_net": False}  # fmt: skip
+    if own_physics:
+        changed["sim_params"] = {
+            "train": {"length": [0.5, 0.6]},
+            "unseen": {"low": {"length": [0.25]}, "high": {"length": [1.5]}},
+        }
     write_run(tmp_path / "a", seed=4, method="mcl", settings_changed=changed)
     (run,), _ = load_runs([tmp_path / "a"])
     program, command, *words = train_command(run)
     assert (program, command) == ("headway", "train")
-    arguments, settings = parse_train(words)
+    page = write_report([tmp_path / "a"], tmp_path / "report.html", only=["runs"]).read_text()
+    written = re.search(r"sim_params.json: ({.*?})<", html.unescape(page))
+    assert (written is not None) == own_physics
+    if written:
+        monkeypatch.chdir(tmp_path)
+        Path("sim_params.json").write_text(written[1])
+    arguments, changed = parse_train(words)
     names = {"method": arguments.method, "preset": arguments.preset, "seed": arguments.seed}
-    assert make_config(arguments.env, **names, settings=settings) == run.config
+    assert make_config(arguments.env, **names, settings=changed) == run.config
+    assert arguments.run_dir == tmp_path / "a"
 
 
 def test_report_command(folder, tmp_path, capsys):

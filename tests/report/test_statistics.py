@@ -1,6 +1,7 @@
 """Against rliable's definitions, written out anew, and numbers that rliable 1.2.0 gave once."""
 
 import itertools
+import re
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from scipy import stats
 from headway.errors import ConfigError
 from headway.experiment.references import normalised
 from headway.report.statistics import (
-    Estimate,
+    Improvement,
     caution,
     estimate,
     interquartile_mean,
@@ -137,24 +138,82 @@ def test_nothing_is_claimed_from_fewer_than_three_seeds(runs):
     assert interval(few) is None
     many = [[0.1, 0.1, 0.1], [0.2, 0.2, 0.2]]
     found = probability_of_improvement(few, many)
-    assert found == Estimate(1.0, None, runs)
+    assert (found.value, found.interval, found.num_runs) == (1.0, None, runs)
     text = verdict("tmcl", "pets", found)
     assert f"{runs} seed" in text
-    assert "too few to claim that tmcl and pets differ; at least 3" in text
+    assert "too few to show that tmcl and pets differ (at least 3 of each are needed)" in text
+    assert "tmcl is above pets in every pair of runs." in text
 
 
 @pytest.mark.parametrize(
     ("improvement", "said"),
     [
-        (Estimate(0.9, (0.7, 1.0), 3), "tmcl is better than pets (probability of"),
-        (Estimate(0.1, (0.0, 0.4), 3), "pets is better than tmcl"),
-        (Estimate(0.6, (0.5, 0.8), 3), "no difference between tmcl and pets is shown"),
+        (Improvement(0.9, (0.7, 1.0), 5, 0.01, 0.008), "tmcl is better than pets (probability of"),
+        (Improvement(0.1, (0.0, 0.4), 5, 0.01, 0.008), "pets is better than tmcl"),
+        (Improvement(0.6, (0.5, 0.8), 5, 0.04, 0.008), "no difference between tmcl and pets is"),
+        (Improvement(0.9, (0.7, 1.0), 5, 0.05, 0.008), "no difference between tmcl and pets is"),
     ],
 )
 def test_verdicts(improvement, said):
     text = verdict("tmcl", "pets", improvement)
     assert text.startswith(said)
-    assert "; 3 seeds)" in text
+    assert re.search(r"; p = 0.0[145]; 5 seeds\)", text)
+
+
+def test_three_seeds_of_one_environment_show_no_difference():
+    high, low = [[3.0, 4.0, 5.0]], [[0.0, 1.0, 2.0]]
+    text = verdict("tmcl", "pets", probability_of_improvement(high, low))
+    assert text == (
+        "3 seeds: too few to show that tmcl and pets differ (the clearest result has p = 0.1);"
+        " tmcl is above pets in every pair of runs."
+    )
+    text = verdict("pets", "tmcl", probability_of_improvement(low, high))
+    assert text.endswith("; tmcl is above pets in every pair of runs.")
+    text = verdict("a", "b", probability_of_improvement([[0.0, 1.0, 2.0]], [[-1.0, -1.0, 0.5]]))
+    assert text.endswith("; a is above b in 89 % of the pairs of runs.")
+    # Groups of one environment are of the same models and add nothing; environments do.
+    groups = probability_of_improvement(high * 2, low * 2, envs=["a", "a"])
+    assert (groups.p_value, groups.lowest_p) == (0.1, 0.1)
+    tasks = probability_of_improvement(high * 2, low * 2, envs=["a", "b"])
+    assert (tasks.p_value, tasks.lowest_p) == (2 / 400, 2 / 400)
+    assert verdict("tmcl", "pets", tasks).startswith("tmcl is better than pets")
+
+
+def test_the_permutation_test_is_that_of_scipy():
+    rng = np.random.default_rng(1)
+    for sizes in ((5, 5), (4, 6), (9, 9)):
+        x, y = (rng.normal([0.0, 5.0], size=(size, 2)) for size in sizes)
+        x += 0.7
+
+        def share(first, second, x=x, y=y):
+            pooled = np.concatenate([x, y])
+            first, second = pooled[first.astype(int)], pooled[second.astype(int)]
+            return np.abs((first[:, None] > second[None]).mean() - 0.5)
+
+        known = stats.permutation_test(
+            (np.arange(sizes[0]), np.arange(sizes[0], sum(sizes))),
+            share,
+            alternative="greater",
+            rng=np.random.default_rng(0),
+            n_resamples=9999 if sum(sizes) <= 10 else 999,
+        )
+        found = probability_of_improvement(x.T, y.T, envs=["a", "a"])
+        assert found.p_value == pytest.approx(known.pvalue, abs=1e-9 if sum(sizes) <= 10 else 0.05)
+
+
+def test_seeds_are_drawn_whole_for_all_groups_of_an_environment():
+    runs = np.array([0.0, 1.0, 2.0, 3.0])
+    one = interval([runs], mean)
+    assert interval([runs, runs], mean, envs=["a", "a"]) == one  # the same runs once more
+    # What one group loses the other wins, run by run: their mean is the same in every draw.
+    assert interval([runs, -runs], mean, envs=["a", "a"]) == (0, 0)
+    low, high = interval([runs, -runs], mean, envs=["a", "b"])
+    assert low < 0 < high
+    one = probability_of_improvement([runs], [runs - 0.5])
+    several = probability_of_improvement([runs] * 3, [runs - 0.5] * 3, envs="aaa")
+    assert several.interval == one.interval
+    with pytest.raises(ConfigError, match="4 and 3 runs"):
+        interval([runs, runs[:3]], mean, envs=["a", "a"])
 
 
 def test_few_seeds_ask_for_caution():
@@ -163,8 +222,9 @@ def test_few_seeds_ask_for_caution():
 
 
 def test_an_improvement_has_its_other_side():
-    assert Estimate(0.75, (0.5, 1.0), 3).complement == Estimate(0.25, (0.0, 0.5), 3)
-    assert Estimate(0.75, None, 2).complement == Estimate(0.25, None, 2)
+    found = Improvement(0.75, (0.5, 1.0), 3, 0.2, 0.1)
+    assert found.complement == Improvement(0.25, (0.0, 0.5), 3, 0.2, 0.1)
+    assert Improvement(0.75, None, 2, 1, 1).complement == Improvement(0.25, None, 2, 1, 1)
 
 
 def test_normalised():

@@ -1,6 +1,7 @@
 """Figure, raw numbers and table of an experiment, and the commands that make them."""
 
 import csv
+import dataclasses
 import json
 import re
 
@@ -14,14 +15,14 @@ from headway.cli import main
 from headway.cli.comparisons import read_seeds, read_settings
 from headway.cli.usage import UsageError
 from headway.compare import reproduce
-from headway.report.comparison.figure import _curves, arm_styles, has_curves
-from headway.report.comparison.runs import Found, Point, find
+from headway.report.comparison.figure import _curves, _dots, arm_styles, has_curves
+from headway.report.comparison.runs import Found, Point, _points, find
 from headway.report.comparison.verdicts import verdicts
-from headway.report.comparison.writing import spread
+from headway.report.comparison.writing import spread, table_rows, write_table
 from headway.storage.run_dir import RunDir
 from headway.sweeps import running
-from headway.sweeps.experiments import EXPERIMENTS, experiment
-from headway.sweeps.jobs import Comparison
+from headway.sweeps.experiments import EXPERIMENTS, Arm, Experiment, experiment, sweep_experiment
+from headway.sweeps.jobs import Cell, Comparison
 from headway.sweeps.running import Workers
 
 HERE = Workers(one_by_one=True)
@@ -68,8 +69,9 @@ def test_files_stand_beside_each_other_and_hold_what_the_runs_say(training, tmp_
         rf"\| MCL \| 3 \| 32.0 ± 1.0 \| {spread_of_three} \| 132.0 ± 1.0 \| – \|", table
     )
     assert "| T-MCL | 3 | 42.0 ± 1.0 | 42.0 (4" in table
-    # All of T-MCL's runs are above all of MCL's.
-    assert "- T-MCL is better than MCL (probability of improvement 1.00, 1.00 to 1.00" in table
+    # All of T-MCL's runs are above all of MCL's, which three seeds show by chance as well.
+    assert "- 3 seeds: too few to show that T-MCL and MCL differ (the clearest result has" in table
+    assert "; T-MCL is above MCL in every pair of runs." in table
     assert "- Intervals from fewer than 10 seeds are too narrow" in table
     assert "    headway reproduce fig13\n" in table
     assert "no difference between arms can be claimed" not in table
@@ -124,6 +126,21 @@ def test_what_learns_nothing_is_a_level_beside_curves(tmp_path):
     assert list(curve.get_xdata()) == [20, 40, 60]
 
 
+def test_an_episode_that_was_cut_bends_no_curve(tmp_path):
+    points = [
+        Point("pendulum", "T-MCL", seed, i, 20 * i + 20 - 6 * (seed == i == 1), 10.0 * i + 2 * seed)
+        for seed in range(3)
+        for i in range(3)
+    ]
+    axes = Figure().subplots()
+    _curves(axes, Found(comparison(tmp_path), [], points, []), "pendulum")
+    (curve,) = axes.get_lines()
+    assert list(curve.get_xdata()) == [20, 38, 60]
+    assert list(curve.get_ydata()) == [2, 12, 22]
+    edges = axes.collections[0].get_paths()[0].vertices
+    assert {float(y) for x, y in edges if x == 38} == {10.0, 14.0}  # one standard deviation
+
+
 def test_training_curves_show_what_was_collected(training, tmp_path):
     done = reproduce(comparison(tmp_path, "fig9", seeds=(0,)), workers=HERE)
     rows = rows_of(tmp_path / "fig9-smoke/fig9.csv")
@@ -148,9 +165,44 @@ def test_arms_are_compared_over_groups_and_environments_of_both(training, tmp_pa
     training.answers = {0: [fakes.DIVERGED]}
     done = reproduce(comparison(tmp_path, envs=("pendulum", "half-cheetah")), workers=HERE)
     assert [tuple(cell) for cell in done.found.missing] == [("pendulum", "MCL", 0)]
-    assert done.found.group_returns("pendulum", "MCL") == {"low": [32, 33], "high": [32, 33]}
+    returns = {1: 32, 2: 33}
+    assert done.found.run_returns("pendulum", "MCL") == {"low": returns, "high": returns}
     (line,) = verdicts(done.found)
-    assert line.startswith("2 seeds: too few to claim that T-MCL and MCL differ")
+    assert line.startswith("2 seeds: too few to show that T-MCL and MCL differ")
+
+
+def test_arms_that_were_not_tested_alike_are_not_compared(training, tmp_path):
+    arms = (Arm("short"), Arm("long", settings={"collection.episode_length": 30}))
+    asked = Comparison(
+        Experiment("own", "lengths", arms), ("pendulum",), (0, 1, 2), "smoke", tmp_path
+    )
+    lines = verdicts(reproduce(asked, workers=HERE).found)
+    assert lines == [
+        "Not compared with short, because physics, episode lengths or options of the environment"
+        " differ: long on pendulum."
+    ]
+
+
+def test_physics_count_once_however_many_episodes_they_have(training, tmp_path):
+    found = reproduce(comparison(tmp_path, seeds=(0,)), workers=HERE).found
+    place = {"env": "pendulum", "arm": "T-MCL", "seed": 0, "iteration": 1, "group": "low"}
+    rows = [
+        {**place, "sim_params": physics, "return": value}
+        for physics, value in (("length=0.25", 0.0), ("length=0.375", 6.0), ("length=0.375", 8.0))
+    ]
+    one = dataclasses.replace(found, rows=rows)
+    assert one.run_returns("pendulum", "T-MCL") == {"low": {0: 3.5}}
+    cell = Cell("pendulum", "T-MCL", 0)
+    (point,) = _points(found.comparison, cell, [{**row, "timesteps": 20} for row in rows])
+    assert point.value == 3.5
+
+
+def test_settings_are_resolved_once_for_all_lines(training, tmp_path, monkeypatch):
+    found = reproduce(comparison(tmp_path, seeds=(0,)), workers=HERE).found
+    calls, cells = [], Comparison.cells.fget
+    monkeypatch.setattr(Comparison, "cells", property(lambda self: calls.append(1) or cells(self)))
+    write_table(dataclasses.replace(found), "")
+    assert len(calls) == 1
 
 
 def test_another_figure_reuses_the_runs(training, tmp_path):
@@ -174,8 +226,48 @@ def test_spread_is_over_seeds():
 
 
 def test_many_arms_can_be_told_apart():
-    styles = arm_styles([f"arm {i}" for i in range(20)])
-    assert len(set(styles.values())) == 20
+    for arms in ([Arm(f"arm {i}") for i in range(20)], experiment("comparison").arms):
+        styles = arm_styles(arms)
+        assert len(set(styles.values())) == len(arms)
+
+
+def test_a_method_looks_the_same_in_every_figure():
+    named = [arm_styles(experiment(name).arms) for name in ("comparison", "fig10", "fig13")]
+    for styles in named[1:]:
+        assert styles.items() <= named[0].items()
+    own = sweep_experiment("own", ["pets", "tmcl"], {})
+    assert arm_styles(own.arms).items() <= named[0].items()
+    heads = arm_styles(experiment("fig14").arms)  # of one method
+    assert len(set(heads.values())) == len(heads)
+
+
+def test_dots_stand_in_the_order_of_results_beside_their_scores(training, tmp_path):
+    changed = {"collection.num_iterations": 1, "collection.episode_length": 200}
+    found = reproduce(comparison(tmp_path, **changed), workers=HERE).found
+    axes = Figure().subplots()
+    _dots(axes, found, "pendulum")
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["T-MCL", "MCL"]
+    assert axes.get_xlabel() == "return per episode, unseen physics"
+    scores = [text.get_text() for text in axes.texts]
+    rows = table_rows(found, "pendulum")
+    assert scores == [rows[1][-1], rows[0][-1], "score"]
+    assert "–" not in scores
+    dots = [line for line in axes.get_lines() if len(line.get_xdata()) == 3]
+    assert [line.get_color() for line in dots] == [
+        arm_styles(found.comparison.experiment.arms)[name][0] for name in ("T-MCL", "MCL")
+    ]
+
+
+def test_arms_of_one_method_keep_their_order_and_titles_are_for_readers(training, tmp_path):
+    asked = comparison(tmp_path, "fig12", seeds=(0,), **{"collection.num_iterations": 1})
+    found = reproduce(asked, workers=HERE).found
+    axes = Figure().subplots()
+    _dots(axes, found, "pendulum")
+    names = [text.get_text() for text in axes.get_yticklabels()]
+    assert names == ["with context", "without context"]
+    drawn = (tmp_path / "fig12-smoke/fig12.svg").read_text()
+    assert "<!-- With and without context learning, pendulum -->" in drawn
+    assert "fig12" not in drawn
 
 
 def run(capsys, *words):

@@ -1,5 +1,6 @@
 """The figures of a run, drawn from the files in its directory alone."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -191,8 +192,7 @@ def prediction_error(run: RunDir, config: Config) -> Path | None:
 
 def evaluation(run: RunDir, config: Config) -> Path | None:
     """Draw the last test's return, and its score where known, for each physics."""
-    rows = run.evaluation()
-    rows = [row for row in rows if row.iteration == max(r.iteration for r in rows)]
+    rows = _last_tests(run.evaluation())
     if not rows:
         return None
     path = run.figures / "evaluation.png"
@@ -259,13 +259,17 @@ def _source(config: Config) -> str:
 
 def _tested(rows: list[EpisodeRow]) -> str:
     """How many episodes the last test had, for example `8 test episodes per group`."""
-    last = [row for row in rows if row.iteration == max(r.iteration for r in rows)]
-    counts = {group: sum(row.group == group for row in last) for group in {r.group for r in last}}
+    counts = Counter(row.group for row in _last_tests(rows))
     if not counts:
         return "no test episodes"
     if len(set(counts.values())) == 1:
         return f"{next(iter(counts.values()))} test episodes per group"
     return "test episodes: " + ", ".join(f"{group} {n}" for group, n in sorted(counts.items()))
+
+
+def _last_tests(rows: list[EpisodeRow]) -> list[EpisodeRow]:
+    last = max((row.iteration for row in rows), default=None)
+    return [row for row in rows if row.iteration == last]
 
 
 def _last_iteration(rows: list[Row]) -> list[Row]:

@@ -28,6 +28,10 @@ UNSEEN = ("#D55E00", "#009E73", "#CC79A7", "#E69F00")
 HEADS = (
     "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#999999",
 )  # fmt: skip
+SERIES = (
+    "#0072B2", "#D55E00", "#009E73", "#B0578D", "#C98A00", "#3F3F46", "#4AA3D6", "#8A7A00",
+)  # fmt: skip
+"""Of methods: Okabe and Ito's hues, dark enough for lines and dots on white."""
 DPI = 160
 
 _MARGIN, _TITLE, _LEGEND = 0.16, 0.42, 0.3  # inches
@@ -75,7 +79,13 @@ SETTINGS: dict[Any, Any] = {
 
 @contextlib.contextmanager
 def figure(
-    path: Path, *, title: str, caption: str, size: tuple[float, float], svg: bool = False
+    path: Path,
+    *,
+    title: str,
+    caption: str,
+    size: tuple[float, float],
+    svg: bool = False,
+    has_legend: bool = True,
 ) -> Iterator[Figure]:
     """Make a figure, hand it out to be drawn on, and write it.
 
@@ -85,6 +95,7 @@ def figure(
         caption: What the marks are and where the numbers come from; wrapped to the width.
         size: Width and height in inches.
         svg: Whether to write an SVG file beside the PNG as well.
+        has_legend: Whether to leave room for a `legend` below the title.
     """
     with matplotlib.rc_context(SETTINGS):
         width, height = size
@@ -92,7 +103,7 @@ def figure(
         FigureCanvasAgg(drawing)
         lines = textwrap.wrap(caption, int((width - 2 * _MARGIN) / _CAPTION_LETTER))
         low = (_MARGIN + _CAPTION_LINE * len(lines)) / height
-        high = 1 - (_TITLE + _LEGEND) / height
+        high = 1 - (_TITLE + _LEGEND * has_legend) / height
         space = (_MARGIN / width / 2, low, 1 - _MARGIN / width, high - low)
         drawing.set_layout_engine(ConstrainedLayoutEngine(rect=space, w_pad=0.06, h_pad=0.06))
         left, top = _MARGIN / width, 1 - _MARGIN / height

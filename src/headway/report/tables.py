@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from rich import box
 from rich.table import Table
+from rich.text import Text
 
 from headway.config import Config
 from headway.experiment.methods import METHODS, PRESETS
@@ -44,19 +45,17 @@ def by_physics(rows: Sequence[EpisodeRow], config: Config) -> list[Facts]:
 
 
 def by_group(rows: Sequence[EpisodeRow], config: Config) -> list[Facts]:
-    """Summarise test episodes for each group.
+    """Summarise test episodes for each group; every physics of it counts once.
 
-    A group's score is the mean over its physics, each counting once; it is None unless a
-    reference is known for every one of them.
+    The score is None unless a reference is known for every physics. The standard deviation is that
+    of episodes.
     """
     parts = by_physics(rows, config)
     facts = []
     for group in dict.fromkeys(row.group for row in rows):
-        scores = [part["score"] for part in parts if part["group"] == group]
-        whole = mean_score(scores)
-        facts.append(
-            {"group": group, **_returns([r for r in rows if r.group == group]), "score": whole}
-        )
+        same = [part for part in parts if part["group"] == group]
+        score = mean_score([part["score"] for part in same])
+        facts.append({"group": group, **_merged(same), "score": score})
     return facts
 
 
@@ -77,10 +76,11 @@ def evaluation(rows: Sequence[EpisodeRow], config: Config, title: str) -> Table:
                 physics = f"  {full_label(part['sim_params'], names)}"
                 table.add_row(physics, *_cells(part, with_score))
         table.add_section()
+    table.caption = (
+        "return: mean ± standard deviation over episodes; every physics of a group counts once"
+    )
     if with_score:
-        table.caption = "score: 0 = random actions, 1 = the paper's planner on the true dynamics"
-    else:
-        table.caption = "return: mean ± standard deviation over episodes"
+        table.caption += "; score: 0 = random actions, 1 = the paper's planner on the true dynamics"
     return table
 
 
@@ -165,6 +165,17 @@ def _returns(rows: Sequence[EpisodeRow]) -> Facts:
     }
 
 
+def _merged(parts: Sequence[Facts]) -> Facts:
+    """The returns of several physics as one, whatever the number of their episodes."""
+    means = np.array([part["return_mean"] for part in parts])
+    variances = np.array([part["return_std"] for part in parts]) ** 2
+    return {
+        "episodes": sum(part["episodes"] for part in parts),
+        "return_mean": float(means.mean()),
+        "return_std": float(np.sqrt((variances + (means - means.mean()) ** 2).mean())),
+    }
+
+
 def _cells(facts: Facts, with_score: bool) -> list[str]:
     spread = f" ± {facts['return_std']:,.1f}" if facts["episodes"] > 1 else ""
     cells = [str(facts["episodes"]), f"{facts['return_mean']:,.1f}{spread}"]
@@ -177,10 +188,23 @@ def _settings(settings: Mapping[str, Any]) -> str:
     return "\n".join(f"{name} {value}" for name, value in settings.items()) or "–"
 
 
-def new_table(title: str, *columns: str) -> Table:
-    """An empty table in the look of all others."""
-    table = Table(
-        *columns, title=title, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD
+class TextTable(Table):
+    """A table whose texts are shown as they are: what is in brackets is no markup."""
+
+    def add_row(self, *cells: Any, **look: Any) -> None:
+        """Add a line of cells; strings are plain text."""
+        plain = [Text(cell) if isinstance(cell, str) else cell for cell in cells]
+        super().add_row(*plain, **look)
+
+
+def new_table(title: str, *columns: str) -> TextTable:
+    """An empty table in the look of all others; its texts are shown as they are."""
+    table = TextTable(
+        *columns,
+        title=Text(title, "bold"),
+        title_justify="left",
+        caption_justify="left",
+        box=box.SIMPLE_HEAD,
     )
-    table.title_style, table.caption_style = "bold", "dim"
+    table.caption_style = "dim"
     return table

@@ -1,7 +1,8 @@
 """What the finished runs of an experiment measured."""
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,10 +11,12 @@ from headway.storage.run_dir import RunDir
 from headway.storage.tables import format_sim_params
 from headway.sweeps.board import first_status
 from headway.sweeps.jobs import Cell, Comparison, Job
+from headway.tasks.catalog import env_options, episode_length, sim_param_sets
 
 COLLECTED = "collected"
 
 Row = dict[str, Any]
+Protocol = tuple[dict[str, list[str]], int, dict[str, bool]]
 
 
 class Point(NamedTuple):
@@ -49,19 +52,45 @@ class Found:
         final = max((point.iteration for point in points), default=0)
         return [point for point in points if point.iteration == final]
 
-    def group_returns(self, env: str, arm: str) -> dict[str, list[float]]:
-        """Mean return of each group after the last iteration, one per seed; not of training."""
+    def run_returns(self, env: str, arm: str) -> dict[str, dict[int, float]]:
+        """Return of each group after the last iteration, by seed; not of training.
+
+        Every physics of a group counts once.
+        """
         final = {(point.seed, point.iteration) for point in self.last(env, arm)}
-        returns: dict[str, dict[int, list[float]]] = {}
-        for row in self.rows:
-            wanted = (row["env"], row["arm"]) == (env, arm) and row["group"] != "train"
-            if wanted and (row["seed"], row["iteration"]) in final:
-                by_seed = returns.setdefault(row["group"], {})
-                by_seed.setdefault(row["seed"], []).append(row["return"])
+        found: dict[str, dict[int, dict[str, list[float]]]] = {}
+        for row in self._rows_by_arm.get((env, arm), []):
+            if row["group"] != "train" and (row["seed"], row["iteration"]) in final:
+                by_seed = found.setdefault(row["group"], {}).setdefault(row["seed"], {})
+                by_seed.setdefault(row["sim_params"], []).append(row["return"])
         return {
-            group: [float(np.mean(values)) for values in by_seed.values()]
-            for group, by_seed in returns.items()
+            group: {seed: mean_of_physics(physics) for seed, physics in by_seed.items()}
+            for group, by_seed in found.items()
         }
+
+    @functools.cached_property
+    def _rows_by_arm(self) -> dict[tuple[str, str], list[Row]]:
+        found: dict[tuple[str, str], list[Row]] = {}
+        for row in self.rows:
+            found.setdefault((row["env"], row["arm"]), []).append(row)
+        return found
+
+    @functools.cached_property
+    def cells(self) -> dict[Cell, Job]:
+        """The places of the table with their jobs; to resolve all settings takes a while."""
+        return self.comparison.cells
+
+    def protocol(self, env: str, arm: str) -> Protocol:
+        """How an arm was tested: physics by group, steps of an episode, options."""
+        cell = Cell(env, arm, self.comparison.seeds[0])
+        config = self.cells[cell].config
+        physics = sim_param_sets(config)
+        groups = {
+            name: sorted(map(format_sim_params, physics.group(name)))
+            for name in physics.group_names
+            if name != "train"
+        }
+        return groups, episode_length(config), env_options(config)
 
     @property
     def final_points(self) -> list[Point]:
@@ -127,8 +156,17 @@ def _episodes(comparison: Comparison, cell: Cell, job: Job) -> list[Row]:
 
 def _points(comparison: Comparison, cell: Cell, rows: Sequence[Row]) -> list[Point]:
     """The mean of every iteration; training physics do not count as unseen ones."""
-    measured = [row for row in rows if row["group"] != "train"]
-    returns: dict[tuple[int, int], list[float]] = {}
-    for row in measured:
-        returns.setdefault((row["iteration"], row["timesteps"]), []).append(row["return"])
-    return [Point(*cell[:2], cell.seed, *when, float(np.mean(r))) for when, r in returns.items()]
+    returns: dict[tuple[int, int], dict[str, list[float]]] = {}
+    for row in rows:
+        if row["group"] != "train":
+            physics = returns.setdefault((row["iteration"], row["timesteps"]), {})
+            physics.setdefault(row["sim_params"], []).append(row["return"])
+    return [
+        Point(*cell[:2], cell.seed, *when, mean_of_physics(physics))
+        for when, physics in returns.items()
+    ]
+
+
+def mean_of_physics(returns: Mapping[str, Sequence[float]]) -> float:
+    """Mean return, every physics counting once however many episodes it had."""
+    return float(np.mean([np.mean(values) for values in returns.values()]))

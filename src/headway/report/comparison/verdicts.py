@@ -1,5 +1,7 @@
 """What can be said of the arms of an experiment, and what cannot."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from headway.report import statistics
@@ -19,26 +21,47 @@ def interquartile(found: Found, env: str, arm: str) -> str:
 def verdicts(found: Found) -> list[str]:
     """Compare the reference of the experiment with every other arm, over all environments.
 
-    Only runs that both arms have in an environment are compared; a task is an environment with
-    one group of physics. The last line warns where intervals come from too few seeds.
+    A task is an environment with one group of physics. An environment counts where both arms were
+    tested alike, and a group where all of their finished runs were. The last lines name what is
+    left out, and warn of intervals that come from too few seeds.
     """
-    arms = found.comparison.experiment.arms
-    reference = found.comparison.experiment.reference_arm
-    lines, counts = [], []
-    for arm in arms:
-        pairs = [
-            (ours[group], theirs[group])
-            for env in found.comparison.envs
-            for ours, theirs in [
-                (found.group_returns(env, reference.label), found.group_returns(env, arm.label))
-            ]
-            for group in ours
-            if group in theirs
-        ]
-        if arm == reference or not pairs:
+    reference = found.comparison.experiment.reference_arm.label
+    lines, counts, unlike = [], [], []
+    for arm in found.comparison.experiment.arms:
+        if arm.label == reference:
             continue
-        improvement = statistics.probability_of_improvement(*zip(*pairs, strict=True))
-        lines.append(statistics.verdict(reference.label, arm.label, improvement))
-        counts += [improvement.num_runs] if improvement.interval else []
+        alike = [
+            env
+            for env in found.comparison.envs
+            if found.protocol(env, reference) == found.protocol(env, arm.label)
+        ]
+        unlike += [f"{arm.label} on {env}" for env in found.comparison.envs if env not in alike]
+        improvement = _improvement(found, alike, reference, arm.label)
+        if improvement is not None:
+            lines.append(statistics.verdict(reference, arm.label, improvement))
+            counts += [improvement.num_runs] if improvement.interval else []
+    if unlike:
+        lines.append(
+            f"Not compared with {reference}, because physics, episode lengths or options of the"
+            f" environment differ: {'; '.join(unlike)}."
+        )
     warning = statistics.caution(min(counts)) if counts else ""
     return [*lines, warning] if warning else lines
+
+
+def _improvement(
+    found: Found, envs: Sequence[str], first: str, second: str
+) -> statistics.Improvement | None:
+    """The probability that one arm improves on another; None where nothing is common to them."""
+    pairs, places = [], []
+    for env in envs:
+        both = [found.run_returns(env, arm) for arm in (first, second)]
+        seeds = [{seed for of in groups.values() for seed in of} for groups in both]
+        for group in both[0]:
+            returns = [groups.get(group, {}) for groups in both]
+            if [set(of) for of in returns] == seeds:
+                pairs.append([[of[seed] for seed in sorted(of)] for of in returns])
+                places.append(env)
+    if not pairs:
+        return None
+    return statistics.probability_of_improvement(*zip(*pairs, strict=True), envs=places)

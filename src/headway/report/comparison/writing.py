@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from headway.report.comparison.runs import COLLECTED, Found
+from headway.report.comparison.scores import last_tests, unseen_scores
 from headway.report.comparison.verdicts import interquartile, verdicts
 from headway.report.statistics import MIN_RUNS
-from headway.report.tables import by_group
 from headway.storage import files, records
-from headway.storage.run_dir import RunDir
 
 RAW_COLUMNS = (
     "experiment", "arm", "env", "method", "preset", "seed", "iteration", "timesteps", "group",
@@ -79,15 +78,9 @@ def spread(values: Sequence[float]) -> str:
 
 def _training_and_score(found: Found, env: str, arm: str) -> list[str]:
     """The last return on training physics, and the mean score of the unseen groups."""
-    training, scores = [], []
-    for cell, job in found.comparison.cells.items():
-        if (cell.env, cell.arm) != (env, arm) or cell in found.missing:
-            continue
-        last = [r for r in RunDir(job.path).evaluation() if r.iteration == job.num_iterations - 1]
-        groups = by_group(last, job.config)
-        training += [g["return_mean"] for g in groups if g["group"] == "train"]
-        unseen = [g["score"] for g in groups if g["group"] != "train"]
-        scores += [] if None in unseen or not unseen else [float(np.mean(unseen))]
+    tests = last_tests(found, env, arm)
+    training = [one["return_mean"] for run in tests for one in run if one["group"] == "train"]
+    scores = unseen_scores(tests)
     return [spread(training), "–" if not scores else f"{np.mean(scores):.2f}"]
 
 
@@ -98,7 +91,8 @@ def _about(found: Found) -> list[str]:
     lines = [
         f"Preset `{comparison.preset}`{changed}, seeds {seeds}. Mean ± standard deviation over"
         " seeds after the last iteration; interquartile mean with its 95 % stratified bootstrap"
-        " interval. The score is that on unseen physics: 0 is random, 1 the paper's planner on the"
+        " interval. Every physics of a group counts once. The score is that on unseen physics: 0"
+        " is random, 1 the paper's planner on the"
         " true dynamics.",
     ]
     if len(comparison.seeds) < MIN_RUNS:

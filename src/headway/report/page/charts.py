@@ -1,5 +1,6 @@
 """What the figures of a comparison draw on their axes."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -21,6 +22,7 @@ from headway.report.style import FAINT, INK, RULE, group_label, label_axis
 from headway.storage.tables import parse_sim_params
 
 Marks = Mapping[str, float]
+TICK_LETTERS = 24  # in a line of a bar's name
 
 
 def color_of(series: Series) -> str:
@@ -87,7 +89,7 @@ def group_bars(
         axes.plot(place + spread, values, MARKERS[0], **style, gid=gid)
     _mark_levels(axes, levels or {})
     axes.axhline(0, color=FAINT, linewidth=0.8)
-    names = [series.label for series, _ in bars]
+    names = [_wrapped(series.label) for series, _ in bars]
     crowded = len(names) > 4 or max(map(len, names)) > 10
     axes.set_xticks(range(len(bars)), names)
     if crowded:
@@ -242,6 +244,10 @@ def look(series: Series) -> dict[str, Any]:
         "linestyle": DASHES[series.round % len(DASHES)],
         "gid": _gid(series),
     }
+
+
+def _wrapped(name: str) -> str:
+    return textwrap.fill(name, TICK_LETTERS, break_long_words=False, break_on_hyphens=False)
 
 
 def _gid(series: Series) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from headway.data import Trajectory
+from headway.errors import RunError
 from headway.experiment.loading import load_agent
 from headway.planning.agent import Agent, encode
 from headway.planning.heads import RecentTransitions
@@ -34,7 +35,8 @@ def embed(run: LoadedRun) -> Embedding | None:
     """Encode what a run collected; None for a model without a learned context.
 
     Raises:
-        RunError: The run has no checkpoint or no collected data, or they are damaged.
+        RunError: The run has no checkpoint or no collected data, or they are damaged; or none of
+            its episodes is longer than the history.
         LimitError: The model needs more memory than is free.
     """
     if run.config.model.kind != "multi-headed":
@@ -45,6 +47,11 @@ def embed(run: LoadedRun) -> Embedding | None:
     if agent.model.context_encoder is None:
         return None
     chosen = moments(directory.load_data(), agent.history_length)
+    if not chosen:
+        raise RunError(
+            f"none of its collected episodes is longer than {agent.history_length} steps, which are"
+            " the history that a context is made of."
+        )
     contexts = encode_moments(agent, chosen)
     physics = [dict(trajectory.sim_params) for trajectory, _ in chosen]
     points, explained = principal_components(contexts[0])

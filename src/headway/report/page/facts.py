@@ -7,7 +7,7 @@ import numpy as np
 from headway.report.page import charts, svg
 from headway.report.page.measures import RAW_COLUMNS, raw_rows
 from headway.report.page.parts import Block, Cell, Line, Panel, Section, Table, identifier
-from headway.report.page.runs import LoadedRun, train_command
+from headway.report.page.runs import PHYSICS_FILE, LoadedRun, physics_file, train_command
 from headway.report.page.series import (
     Comparison,
     differing_settings,
@@ -92,26 +92,33 @@ def _minutes(value: float) -> Cell:
 
 def sources(comparison: Comparison) -> Section:
     """The runs, and the command that makes each."""
-    lines = []
-    for env in comparison.envs:
-        for series in comparison.series_of(env):
-            for run in comparison.runs_of(env, series):
-                done = f"{len(run.metrics)} of {run.config.collection.num_iterations}"
-                command = shlex.join(train_command(run))
-                cells = [
-                    Cell(str(run.path), [command], is_code=True),
-                    Cell(series.label, is_key=True),
-                    Cell(str(run.config.seed), is_number=True),
-                    Cell(done, is_number=True),
-                ]
-                lines.append(Line(cells, series.index))
+    lines = [
+        _source(run, series.label, series.index)
+        for env in comparison.envs
+        for series in comparison.series_of(env)
+        for run in comparison.runs_of(env, series)
+    ]
+    labelled = zip(comparison.reference_runs, comparison.reference_labels, strict=True)
+    lines += [_source(run, label) for run, label in labelled]
     table = Table(["run, and the command that makes it", "method", "seed", "iterations"], lines)
-    return Section(
-        "runs",
-        "Runs",
-        "Every run on this page. The command resumes a run that was interrupted.",
-        [Block(table=table)],
-    )
+    lead = "Every run on this page. The command resumes a run that was interrupted."
+    if comparison.reference_runs:
+        lead += " Runs without a symbol are references: scores are normalised by them."
+    return Section("runs", "Runs", lead, [Block(table=table)])
+
+
+def _source(run: LoadedRun, label: str, series: int | None = None) -> Line:
+    done = f"{len(run.metrics)} of {run.config.collection.num_iterations}"
+    below = [shlex.join(train_command(run))]
+    if physics := physics_file(run):
+        below.append(f"{PHYSICS_FILE}: {physics}")
+    cells = [
+        Cell(str(run.path), below, is_code=True),
+        Cell(label, is_key=series is not None),
+        Cell(str(run.config.seed), is_number=True),
+        Cell(done, is_number=True),
+    ]
+    return Line(cells, series)
 
 
 def numbers(comparison: Comparison) -> Section:
@@ -120,11 +127,15 @@ def numbers(comparison: Comparison) -> Section:
     index = {series.label: series.index for series in comparison.series}
     shown = RAW_COLUMNS[:-1]
     lines = [
-        Line([_raw_cell(name, row[name]) for name in shown], index[row["method"]]) for row in rows
+        Line(
+            [_raw_cell(name, row[name], row["method"] in index) for name in shown],
+            index.get(row["method"]),
+        )
+        for row in rows
     ]
     lead = (
         "Each finished run's test episodes for every physics: mean and standard deviation over"
-        " episodes."
+        " episodes. Runs without a symbol are references."
     )
     blocks = [Block(table=Table([name.replace("_", " ") for name in shown], lines))]
     csv = csv_lines(RAW_COLUMNS, rows, header=True)
@@ -133,6 +144,7 @@ def numbers(comparison: Comparison) -> Section:
     return Section("numbers", "Raw numbers", lead, blocks, csv=csv)
 
 
-def _raw_cell(column: str, value: object) -> Cell:
+def _raw_cell(column: str, value: object, has_symbol: bool) -> Cell:
     text = value_text(value)
-    return Cell(text, is_number=column not in _TEXTS, is_key=column == "method")
+    is_key = has_symbol and column == "method"
+    return Cell(text, is_number=column not in _TEXTS, is_key=is_key)

@@ -51,12 +51,14 @@ def curve_groups(comparison: Comparison, env: str) -> list[str]:
 
 def outcomes(comparison: Comparison, env: str, series: Series, group: str) -> list[Outcome]:
     """One outcome per finished run of a series, in the order of seeds."""
-    return comparison.outcomes.get((env, series.label, group), [])
+    runs = comparison.outcomes.get((env, series.label), [])
+    return [run[group] for run in runs if group in run]
 
 
 def has_scores(comparison: Comparison, env: str) -> bool:
     """Whether every finished run of an environment has a score on every group."""
-    found = [one for place, of in comparison.outcomes.items() if place[0] == env for one in of]
+    runs = [run for place, found in comparison.outcomes.items() if place[0] == env for run in found]
+    found = [one for run in runs for one in run.values()]
     return bool(found) and all(one.score is not None for one in found)
 
 
@@ -69,23 +71,41 @@ def values(comparison: Comparison, env: str, series: Series, group: str) -> list
     ]
 
 
+def unlike(comparison: Comparison) -> list[tuple[str, str]]:
+    """Environments and groups in which methods were not tested alike (`Comparison.tasks`)."""
+    found: dict[tuple[str, str], set[frozenset]] = {}
+    for (env, _, group), places in comparison.tasks.items():
+        found.setdefault((env, group), set()).add(places)
+    return [name for name, tasks in found.items() if len(tasks) > 1]
+
+
 def improvement(
     comparison: Comparison, first: Series, second: Series
-) -> statistics.Estimate | None:
-    """Probability that one series beats another on the unseen groups that both were tested on."""
-    tasks = [
-        (values(comparison, env, first, group), values(comparison, env, second, group))
-        for env in comparison.envs
-        for group in groups(comparison, env)
-        if group != TRAIN
-    ]
-    tasks = [(a, b) for a, b in tasks if a and b]
-    if not tasks:
+) -> statistics.Improvement | None:
+    """Probability that one series beats another on the unseen groups that both were tested on.
+
+    A group counts where both were tested alike (`unlike`), and all of their runs were.
+    """
+    pairs, envs = [], []
+    for env in comparison.envs:
+        for group in groups(comparison, env):
+            if group != TRAIN and _compared(comparison, env, first, second, group):
+                pairs.append([values(comparison, env, one, group) for one in (first, second)])
+                envs.append(env)
+    if not pairs:
         return None
-    return statistics.probability_of_improvement(*zip(*tasks, strict=True))
+    return statistics.probability_of_improvement(*zip(*pairs, strict=True), envs=envs)
 
 
-def improvements_of(comparison: Comparison) -> dict[tuple[str, str], statistics.Estimate]:
+def _compared(comparison: Comparison, env: str, first: Series, second: Series, group: str) -> bool:
+    names = [(env, one.label) for one in (first, second)]
+    runs = [run for name in names for run in comparison.outcomes.get(name, [])]
+    everywhere = bool(runs) and all(group in run for run in runs)
+    one, other = (comparison.tasks.get((*name, group)) for name in names)
+    return everywhere and one is not None and one == other
+
+
+def improvements_of(comparison: Comparison) -> dict[tuple[str, str], statistics.Improvement]:
     """The same for all pairs of series that can be compared, by their labels, both ways round."""
     pairs = itertools.combinations(comparison.series, 2)
     found = {(a.label, b.label): improvement(comparison, a, b) for a, b in pairs}
@@ -95,16 +115,23 @@ def improvements_of(comparison: Comparison) -> dict[tuple[str, str], statistics.
 
 def aggregate(comparison: Comparison, series: Series) -> statistics.Estimate | None:
     """Interquartile mean score over all unseen groups; None unless it was tested on each."""
-    tasks = []
+    tasks, envs = [], []
     for env in comparison.envs:
         if not has_scores(comparison, env):
             return None
-        tasks += [
-            values(comparison, env, series, group)
-            for group in groups(comparison, env)
-            if group != TRAIN
-        ]
-    return statistics.estimate(tasks) if tasks and all(tasks) else None
+        for group in groups(comparison, env):
+            if group != TRAIN:
+                tasks.append(values(comparison, env, series, group))
+                envs.append(env)
+    complete = all(_is_complete(comparison, env, series) for env in comparison.envs)
+    return statistics.estimate(tasks, envs=envs) if tasks and complete else None
+
+
+def _is_complete(comparison: Comparison, env: str, series: Series) -> bool:
+    """Whether every finished run of a series was tested on all unseen groups."""
+    wanted = [group for group in groups(comparison, env) if group != TRAIN]
+    runs = comparison.outcomes.get((env, series.label), [])
+    return bool(runs) and all(group in run for run in runs for group in wanted)
 
 
 def curve(runs: Sequence[LoadedRun], group: str) -> Curve | None:
@@ -137,19 +164,22 @@ def _returns(run: LoadedRun, group: str) -> dict[int, tuple[float, float]]:
     """Steps and mean return by iteration."""
     found = {}
     for row in run.metrics:
-        summary = row["collection"] if group == COLLECTED else row.get("evaluation", {}).get(group)
+        tables = row if group == COLLECTED else row.get("evaluation", {})
+        summary = tables.get("collection" if group == COLLECTED else group)
         if summary is not None:
             found[row["iteration"]] = row["timesteps"], summary["return_mean"]
     return found
 
 
 def raw_rows(comparison: Comparison) -> list[Row]:
-    """Every finished run's returns for each physics."""
+    """Every finished run's returns for each physics, those of references last."""
     rows = []
     for env in comparison.envs:
         for series in comparison.series_of(env):
             for run in comparison.runs_of(env, series):
                 rows += _raw(comparison, run, series.label)
+    for run, label in zip(comparison.reference_runs, comparison.reference_labels, strict=True):
+        rows += _raw(comparison, run, label)
     return rows
 
 

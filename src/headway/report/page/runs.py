@@ -1,6 +1,7 @@
 """Reading the runs that a report is made of; whatever is damaged costs one line, not the report."""
 
 import dataclasses
+import json
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,6 +13,8 @@ from headway.experiment.methods import make_config
 from headway.storage import config_file
 from headway.storage.run_dir import RunDir
 from headway.storage.tables import EpisodeRow
+
+PHYSICS_FILE = "sim_params.json"
 
 Row = dict[str, Any]
 Content = TypeVar("Content")
@@ -141,30 +144,26 @@ def _without_copies(runs: Sequence[LoadedRun], notes: list[Note]) -> list[Loaded
 
     What is tolerated of an environment (`settings.TOLERANCE`) makes no other run.
     """
-    kept: list[tuple[Config, LoadedRun]] = []
+    kept: dict[str, LoadedRun] = {}
     for run in runs:
-        config = settings.tolerating_as(run.config, runs[0].config)
-        same = next((o for known, o in kept if not settings.differences(known, config)), None)
-        if same is None:
-            kept.append((config, run))
-        else:
+        relevant = settings.relevant(run.config)
+        used = {n: value for n, value in relevant.items() if n not in settings.TOLERANCE}
+        same = kept.setdefault(json.dumps(used, sort_keys=True), run)
+        if same is not run:
             notes.append(Note(run.path, f"left out: same settings and seed as {same.path}."))
-    return [run for _, run in kept]
+    return list(kept.values())
 
 
 def train_command(run: LoadedRun) -> list[str]:
-    """The words of the command that makes a run anew; settings that differ are named.
+    """The words of the command that makes a run, or resumes it; settings that differ are named.
 
-    Environment options and other physics go through files and switches of their own.
+    Physics of its own are in a file (`physics_file`).
     """
     config = run.config
     words = ["headway", "train", config.env, "--method", config.method, "--preset", config.preset]
-    words += ["--seed", str(config.seed)]
-    try:
-        default = make_config(
-            config.env, method=config.method, preset=config.preset, seed=config.seed
-        )
-    except HeadwayError:  # an environment or a method that is not registered here
+    words += ["--seed", str(config.seed), "--run-dir", str(run.path)]
+    default = _default(config)
+    if default is None:
         return words
     usual = settings.flatten(settings.to_dict(default))
     for name, value in settings.flatten(settings.to_dict(config)).items():
@@ -175,8 +174,23 @@ def train_command(run: LoadedRun) -> list[str]:
     if changed:
         words += ["--env-options", *(f"{n}={'on' if v else 'off'}" for n, v in changed.items())]
     if config.sim_params != default.sim_params:
-        words += ["--sim-params", "FILE.json"]
+        words += ["--sim-params", PHYSICS_FILE]
     return words
+
+
+def physics_file(run: LoadedRun) -> str | None:
+    """What the file of physics holds that `train_command` names; None if it names none."""
+    default, own = _default(run.config), run.config.sim_params
+    return json.dumps(own.to_dict()) if own and default and own != default.sim_params else None
+
+
+def _default(config: Config) -> Config | None:
+    """What a method and a preset make of an environment; None where one is not registered here."""
+    names = {"method": config.method, "preset": config.preset, "seed": config.seed}
+    try:
+        return make_config(config.env, **names)
+    except HeadwayError:
+        return None
 
 
 def _option(name: str, value: Any) -> list[str]:

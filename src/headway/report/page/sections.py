@@ -1,11 +1,12 @@
 """The chapters of the page that show how well methods do."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from headway.report import statistics
 from headway.report.page import charts, svg
 from headway.report.page.measures import (
+    TRAIN,
     aggregate,
     curve,
     curve_groups,
@@ -13,6 +14,7 @@ from headway.report.page.measures import (
     has_scores,
     improvements_of,
     outcomes,
+    unlike,
     values,
 )
 from headway.report.page.parts import Block, Cell, Line, Panel, Section, Table, identifier
@@ -36,6 +38,8 @@ def results(comparison: Comparison) -> Section:
 
 
 def _all_environments(comparison: Comparison) -> Block | None:
+    if remark := _unlike(comparison):
+        return Block("All environments", texts=[remark])
     lines = []
     for series in comparison.series:
         found = aggregate(comparison, series)
@@ -62,7 +66,25 @@ def _results_of(comparison: Comparison, env: str) -> Block:
         texts.append(f"Scores are {comparison.references.describe(env)}.")
     else:
         texts.append("Returns: no references are known for all of these physics.")
+    if remark := _unlike(comparison, env):
+        texts.append(remark)
     return Block(env, table=Table(columns, lines), texts=texts)
+
+
+def _unlike(comparison: Comparison, env: str | None = None) -> str:
+    """Warn of numbers that stand beside each other but are of other tasks."""
+    found = [
+        (where, group)
+        for where, group in unlike(comparison)
+        if env == where or (env is None and group != TRAIN)
+    ]
+    if not found:
+        return ""
+    names = "; ".join(group if env else f"{where}, {group}" for where, group in found)
+    return (
+        "Not tested alike, so not compared: other physics, episode lengths or options of the"
+        f" environment in {names}."
+    )
 
 
 def _result(comparison: Comparison, env: str, series: Series, group: str) -> Cell:
@@ -128,7 +150,7 @@ def learning(comparison: Comparison) -> Section:
     lead = (
         "Lines are means over seeds. Bands are 95 % bootstrap intervals of the mean; with fewer"
         " than three seeds each seed has a thin line instead. Dotted thin lines are unfinished"
-        " runs. The first iteration acts at random."
+        " runs. Every test episode counts once. The first iteration acts at random."
     )
     return Section("learning-curves", "Learning curves", lead, blocks)
 
@@ -187,9 +209,15 @@ def _bars(comparison: Comparison, env: str, group: str) -> Panel | None:
         lambda axes: charts.group_bars(axes, found, label, levels),
         name=identifier("bars", env, group),
         label=f"{label} of each method on {env}, {title}",
-        size=(3.5, 2.5 if len(found) <= 4 else 2.9),
+        size=(3.5, _bars_height([series.label for series, _ in found])),
     )
     return Panel(title, drawn)
+
+
+def _bars_height(labels: Sequence[str]) -> float:
+    """Inches that leave the bars room above their names."""
+    longest = min(max(map(len, labels)), charts.TICK_LETTERS)
+    return (2.5 if len(labels) <= 4 else 2.9) + 0.03 * max(longest - 10, 0)
 
 
 def improvements(comparison: Comparison) -> Section:
@@ -215,14 +243,17 @@ def improvements(comparison: Comparison) -> Section:
         for (one, other), estimate in found.items()
         if one == first
     ]
-    block = Block(table=table, claims=claims, texts=[_caution(found)])
+    remarks = [text for text in (_caution(found), _unlike(comparison)) if text]
+    block = Block(table=table, claims=claims, texts=remarks)
     if not found:
-        block = Block(texts=["No two methods were tested on the same unseen physics."])
+        texts = ["No two methods were tested on the same unseen physics."]
+        block = Block(texts=[*texts, *remarks])
     return Section("improvement", "Probability of improvement", lead, [block])
 
 
-def _caution(found: Mapping[tuple[str, str], Estimate]) -> str:
-    return statistics.caution(min((one.num_runs for one in found.values()), default=0))
+def _caution(found: Mapping[tuple[str, str], statistics.Improvement]) -> str:
+    counts = [one.num_runs for one in found.values()]
+    return statistics.caution(min(counts)) if counts else ""
 
 
 def _improvement(found: Estimate | None) -> Cell:

@@ -8,10 +8,19 @@ from typing import Any
 from headway import settings
 from headway.experiment.methods import METHODS
 from headway.report.page.runs import LoadedRun, Note
-from headway.report.page.scoring import REFERENCES, Outcome, References, outcome
+from headway.report.page.scoring import (
+    REFERENCES,
+    Outcome,
+    Place,
+    References,
+    by_group,
+    outcome,
+    place_of,
+)
 
 _NAMES = ("env", "method", "seed", *settings.TOLERANCE)  # differ without making a variant
 _SWATCHES = 8
+_LABEL = 60  # letters of a series' name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,13 +51,18 @@ class Comparison:
     series: list[Series]
     references: References
     """Returns that scores are normalised with."""
+    reference_runs: list[LoadedRun]
+    """The runs that the references come from; none where they are compared like methods."""
     notes: list[Note]
 
     @classmethod
     def of(cls, runs: Sequence[LoadedRun], notes: Sequence[Note] = ()) -> "Comparison":
         """Sort runs into series."""
         references = References.of(runs)
-        compared = [run for run in runs if run.config.method not in REFERENCES] or runs
+        others = [run for run in runs if run.config.method in REFERENCES]
+        compared = [run for run in runs if run.config.method not in REFERENCES]
+        if not compared:
+            compared, others = others, []
         labels = series_labels(compared)
         order = list(METHODS)
         methods = sorted(
@@ -68,19 +82,34 @@ class Comparison:
         for run, label in zip(compared, labels, strict=True):
             found.setdefault((run.config.env, label), []).append(run)
         series = [Series(label, index) for index, label in enumerate(names)]
-        return cls(found, series, references, list(notes))
+        notes = [*notes, *references.notes(compared)]
+        return cls(found, series, references, others, notes)
 
     @functools.cached_property
-    def outcomes(self) -> dict[tuple[str, str, str], list[Outcome]]:
-        """Of every finished run, by environment, label and group, in the order of seeds."""
-        found: dict[tuple[str, str, str], list[Outcome]] = {}
+    def outcomes(self) -> dict[tuple[str, str], list[dict[str, Outcome]]]:
+        """By environment and label: of every finished run its outcomes by group."""
+        found: dict[tuple[str, str], list[dict[str, Outcome]]] = {}
+        for place, runs in self.runs.items():
+            tested = [(run, by_group(run.tests)) for run in runs if run.tests]
+            found[place] = [
+                {group: outcome(rows, self.references, run.config) for group, rows in of.items()}
+                for run, of in tested
+            ]
+        return found
+
+    @functools.cached_property
+    def tasks(self) -> dict[tuple[str, str, str], frozenset[Place]]:
+        """What was tested, by environment, label and group.
+
+        Groups of one name may have other physics, episode lengths or options of the environment.
+        """
+        found: dict[tuple[str, str, str], set[Place]] = {}
         for (env, label), runs in self.runs.items():
             for run in runs:
-                for group in dict.fromkeys(row.group for row in run.tests):
-                    rows = [row for row in run.tests if row.group == group]
-                    places = found.setdefault((env, label, group), [])
-                    places.append(outcome(rows, self.references, run.config))
-        return found
+                for row in run.tests:
+                    places = found.setdefault((env, label, row.group), set())
+                    places.add(place_of(row, run.config))
+        return {name: frozenset(places) for name, places in found.items()}
 
     @functools.cached_property
     def envs(self) -> list[str]:
@@ -101,6 +130,11 @@ class Comparison:
         chosen = self.series_of(env) if series is None else [series]
         return [run for one in chosen for run in self.runs.get((env, one.label), [])]
 
+    @functools.cached_property
+    def reference_labels(self) -> list[str]:
+        """How the reference runs are named, in their order."""
+        return series_labels(self.reference_runs)
+
     def label_of(self, run: LoadedRun) -> str:
         """The label of the series that a run belongs to."""
         return next(label for (_, label), runs in self.runs.items() if run in runs)
@@ -110,23 +144,53 @@ def series_labels(runs: Sequence[LoadedRun]) -> list[str]:
     """Name every run by its method, and by what tells variants of a method apart.
 
     A setting counts if it differs between runs of the same method in the same environment,
-    seeds aside; what only follows the environment does not.
+    seeds aside; what only follows the environment or the preset does not. Labels that would be
+    long end with a number; the page's settings say the rest.
     """
     flat = [_settings(run) for run in runs]
-    differing: dict[str, list[str]] = {}
-    for method in {run.config.method for run in runs}:
-        for env in {run.config.env for run in runs}:
-            same = [
-                values
-                for run, values in zip(runs, flat, strict=True)
-                if (run.config.method, run.config.env) == (method, env)
-            ]
-            names = differing.setdefault(method, [])
-            names += [name for name in differing_settings(same) if name not in names]
-    return [
-        ", ".join([run.config.method, *_variant(values, differing[run.config.method])])
+    names = _differing(runs, flat)
+    labels = [
+        ", ".join([run.config.method, *_variant(values, names[run.config.method])])
         for run, values in zip(runs, flat, strict=True)
     ]
+    short = {}
+    for method in names:
+        of_method = [
+            label for run, label in zip(runs, labels, strict=True) if run.config.method == method
+        ]
+        for number, label in enumerate(dict.fromkeys(of_method), 1):
+            short[label] = _shortened(label, number)
+    return [short[label] for label in labels]
+
+
+def _differing(
+    runs: Sequence[LoadedRun], flat: Sequence[Mapping[str, Any]]
+) -> dict[str, list[str]]:
+    """Names of the settings that tell variants apart, by method."""
+    places: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for run, values in zip(runs, flat, strict=True):
+        places.setdefault((run.config.method, run.config.env), []).append(values)
+    found: dict[str, list[str]] = {}
+    for (method, _), same in places.items():
+        names = found.setdefault(method, [])
+        names += [name for name in _telling(same) if name not in names]
+    return found
+
+
+def _telling(values: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Settings that differ, without those that the preset explains."""
+    presets = [
+        [table for table in values if table["preset"] == preset]
+        for preset in dict.fromkeys(table["preset"] for table in values)
+    ]
+    unexplained = {name for same in presets for name in differing_settings(same)}
+    return [n for n in differing_settings(values) if n == "preset" or n in unexplained]
+
+
+def _shortened(label: str, number: int) -> str:
+    if len(label) <= _LABEL:
+        return label
+    return f"{label[:_LABEL].rpartition(', ')[0] or label[:_LABEL]}, … variant {number}"
 
 
 def differing_settings(values: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -145,9 +209,14 @@ def _settings(run: LoadedRun) -> dict[str, Any]:
 
 
 def _variant(values: Mapping[str, Any], names: Sequence[str]) -> list[str]:
-    """Word what is special, for example `num heads 5`."""
-    return [f"{name.rpartition('.')[2].replace('_', ' ')} {value_text(values.get(name))}"
-            for name in names]  # fmt: skip
+    """Word what is special, for example `num heads 5`; sections tell equal names apart."""
+    last = [name.rpartition(".")[2] for name in names]
+    worded = []
+    for name in names:
+        parts = name.split(".")
+        shown = parts[-1:] if last.count(parts[-1]) == 1 else parts[-2:]
+        worded.append(f"{' '.join(shown).replace('_', ' ')} {value_text(values.get(name))}")
+    return worded
 
 
 def value_text(value: Any) -> str:

@@ -22,17 +22,11 @@ from headway.report import style
 
 PANEL = (3.5, 2.5)  # inches
 
-SWATCHES = (
-    ("#0072b2", "#5aaee8"),
-    ("#d55e00", "#f28a45"),
-    ("#009e73", "#35c79a"),
-    ("#b0578d", "#e39cc6"),
-    ("#c98a00", "#f0b93a"),
-    ("#3f3f46", "#d4d4d8"),
-    ("#4aa3d6", "#a5d8f6"),
-    ("#8a7a00", "#ded35c"),
-)
-"""Colours of series in light and dark: Okabe and Ito's hues, dark enough for lines on white."""
+_IN_DARK = (
+    "#5aaee8", "#f28a45", "#35c79a", "#e39cc6", "#f0b93a", "#d4d4d8", "#a5d8f6", "#ded35c",
+)  # fmt: skip
+SWATCHES = tuple(zip(map(str.lower, style.SERIES), _IN_DARK, strict=True))
+"""Colours of series in light and dark."""
 
 _SCALE = matplotlib.colormaps["plasma"]
 ORDERED = tuple(
@@ -56,6 +50,9 @@ THEME = {
 """Variables of the style sheet: their value in light and in dark."""
 
 _VARIABLES = {light.lower(): f"var(--{name})" for name, (light, _) in THEME.items()}
+_COORDINATES = re.compile(
+    r' (?:d|points|transform|[xy][12]?|c[xy]|r|width|height)="[^"]*"'  # attributes that hold them
+)
 _SETTINGS: dict[Any, Any] = {
     "svg.fonttype": "none",
     "text.parse_math": False,  # a dollar is a dollar
@@ -107,9 +104,14 @@ def _inline(document: str, name: str, label: str) -> str:
     svg = re.sub(r' id="([^"]+)"', lambda match: match[0] if match[1] in wanted else "", svg)
     svg = re.sub(r"<style.*?</style>", "", svg, flags=re.DOTALL)  # the page has it
     svg = re.sub(r" font-family: [^;\"]*;", "", svg)
-    svg = re.sub(r"(\d\.\d\d)\d+", r"\1", svg)
+    svg = re.sub(r"<\w[^<>]*>", _trimmed, svg)
     return re.sub(r"\s*\n\s*", "\n", svg).strip()
 
 
 def _themed(match: re.Match[str]) -> str:
     return f"{match[1]}: {_VARIABLES.get(match[2], match[2])}"
+
+
+def _trimmed(tag: re.Match[str]) -> str:
+    """A tag whose coordinates have two decimals; what is written for readers stays as it is."""
+    return _COORDINATES.sub(lambda found: re.sub(r"(\d\.\d\d)\d+", r"\1", found[0]), tag[0])
