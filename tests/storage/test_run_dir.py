@@ -15,6 +15,7 @@ from headway.errors import LimitError, RunError
 from headway.experiment import training
 from headway.report.figures import save_run_figures
 from headway.storage import files
+from headway.storage.iterations import Iterations
 from headway.storage.manifest import Manifest
 from headway.storage.run_dir import RunDir
 
@@ -45,6 +46,23 @@ def test_a_run_of_every_schema_is_read(sample):
     assert save_run_figures(sample)
     action = headway.load(sample).act(np.array([1.0, 0.0, 0.0]))
     assert action.shape == (1,)
+
+
+def test_a_run_is_read_while_an_iteration_is_finished(root, tmp_path, monkeypatch):
+    newer = root / "manifests" / "iteration-001.json"
+    hidden = newer.rename(tmp_path / "newer.json")
+    newest = Iterations.newest
+
+    def then_finished(self):
+        found = newest(self)
+        if hidden.exists():
+            hidden.rename(newer)
+        return found
+
+    monkeypatch.setattr(Iterations, "newest", then_finished)
+    assert [row["iteration"] for row in RunDir(root).metrics()] == [0]
+    assert newer.exists()
+    assert len(RunDir(root).metrics()) == 2
 
 
 def test_a_run_of_every_schema_goes_on(sample):

@@ -218,6 +218,9 @@ def test_dry_run_lists_and_runs_nothing(training, tmp_path, capsys):
     facts = json.loads(out)
     assert [entry["state"] for entry in facts["runs"]] == ["waiting"] * 5
     assert facts["runs"][0]["arms"] == ["M = 1"]
+    assert facts["note"] == ""
+    words = ("reproduce", "comparison", *words[2:])
+    assert "missing runs that plan on the true dynamics" in run(capsys, *words)[1]
     assert training.calls == []
     assert list(tmp_path.iterdir()) == []
 

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from headway.errors import ConfigError, RunError, SeedsError
 from headway.experiment.loading import load_task
+from headway.experiment.methods import make_config
 from headway.planning.flop import plan_flop
 from headway.storage.run_dir import RunDir
 from headway.storage.run_lock import locked
@@ -258,6 +259,25 @@ def test_an_estimate_counts_what_is_missing_at_the_speed_of_what_is_done(tmp_pat
     # The fake run says that it took 4 seconds per iteration, and has 2.
     assert plan.seconds() == pytest.approx(16.0)
     assert plan.source == "1 finished runs"
+
+
+def test_runs_that_learn_nothing_tell_no_speed(tmp_path):
+    learns_nothing = [
+        Job.of(make_config("pendulum", method=method, preset="smoke"), tmp_path)
+        for method in ("random", "true-dynamics")
+    ]
+    fakes.write_run(learns_nothing[0].config, learns_nothing[0].path)
+    jobs = [fakes.tiny_job(tmp_path), *learns_nothing]
+    plan = make_plan(jobs)
+    assert [one.state for one in plan.jobs] == ["waiting", "done", "waiting"]
+    assert "just now" in plan.source
+    assert 0 < plan.seconds() < 60
+    assert "the time of 1 missing runs that plan on the true dynamics" in plan.note
+    fakes.write_run(learns_nothing[1].config, learns_nothing[1].path)
+    fakes.write_run(jobs[0].config, jobs[0].path)
+    plan = make_plan([*jobs, fakes.tiny_job(tmp_path, 1)])
+    assert plan.seconds() == pytest.approx(8.0)  # as long as the only run that learned
+    assert (plan.source, plan.note) == ("1 finished runs", "")
 
 
 def test_arithmetic_of_a_run_follows_its_settings(tmp_path):

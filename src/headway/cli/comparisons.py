@@ -173,10 +173,11 @@ def _print_plan(comparison: "Comparison", as_json: bool) -> int:
     from headway.report.comparison.terminal import plan
     from headway.sweeps.cost import make_plan
 
-    entries, table = plan(comparison, make_plan(comparison.jobs))
+    planned = make_plan(comparison.jobs)
+    entries, table = plan(comparison, planned)
     if as_json:
-        return print_json(entries)
-    print_tables(table)
+        return print_json({**entries, "note": planned.note})
+    print_tables(table, *[planned.note] * bool(planned.note))
     return 0
 
 
