@@ -340,7 +340,8 @@ def train_run(
     run = RunDir(run_dir)
     if not ignore_limits:
         check_memory(need_of(config))
-    with progress or Progress() as shown, run.locked(), stop_requests() as stop:
+    # A display begins once it is certain that the run does.
+    with run.locked(), progress or Progress() as shown, stop_requests() as stop:
         if resume_from_last_good:
             shown.message(went_back(run.go_back()))
         trainer = Trainer.open(config, run, shown, stop)

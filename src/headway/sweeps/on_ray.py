@@ -26,7 +26,7 @@ from headway.storage.interrupts import stop_requests
 from headway.sweeps.board import Board, first_status
 from headway.sweeps.jobs import Job
 from headway.sweeps.running import PATIENCE, Workers, make_run
-from headway.sweeps.status import Status
+from headway.sweeps.status import Status, reason
 
 MAX_LOSSES = 5  # of one run's workers, without an iteration finished between them
 POLL = 0.5  # seconds
@@ -201,7 +201,7 @@ class _Dispatcher:
             return Status(**ended)
         except RayTaskError as error:
             cause = error.cause if isinstance(error.cause, Exception) else error
-            return Status("failed", reached, note=f"{type(cause).__name__}: {cause}")
+            return Status("failed", reached, note=reason(cause))
         except (TaskUnschedulableError, RuntimeEnvSetupError) as error:
             return Status("failed", reached, note=str(error))
         except RayError as error:
