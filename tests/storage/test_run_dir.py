@@ -2,6 +2,7 @@
 
 import ast
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -194,6 +195,22 @@ def test_a_full_disk_is_noticed_before_anything_is_written(root, monkeypatch):
 
 PICKLES = {"pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve", "yaml", "torch"}
 EVALUATING = {"eval", "exec", "compile", "__import__"}
+
+
+@pytest.mark.parametrize("name", ["fifo", "folder", ".", "link"])
+def test_only_regular_files_are_replaced(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("fifo")
+    Path("folder").mkdir()
+    Path("link").symlink_to("fifo")
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(RunError, match=r"is no regular file, allowed: .*; choose another name\.$"):
+        files.write_bytes(Path(name), b"content")
+    assert sorted(tmp_path.iterdir()) == before
+    assert Path("fifo").is_fifo()
+    files.write_bytes(Path("file"), b"content")
+    files.write_bytes(Path("file"), b"other")
+    assert Path("file").read_bytes() == b"other"
 
 
 def test_nothing_in_the_package_can_turn_a_file_into_code():

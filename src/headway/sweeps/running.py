@@ -134,7 +134,7 @@ def make_together(jobs: Sequence[Job], board: Board) -> None:
             train_seeds(jobs[0].config, places, of_seed=told)
         except SeedsError as error:
             failures = error.failures
-        except Exception as error:  # noqa: BLE001 (alone, what is at fault fails alone)
+        except Exception as error:  # alone, what is at fault fails alone
             board.message(f"each seed by itself, because {reason(error)}")
     for job in jobs:  # what is finished by now is not made again
         failure = failures.get(job.config.seed)
@@ -167,7 +167,7 @@ def make_run(job: Job, tell: Tell) -> Status:
         if not job.finished:
             train_run(job.config, job.path, StatusProgress(note, job.finished_iterations))
         done = Status("done", job.num_iterations, returns=reached.returns)
-    except Exception as error:  # noqa: BLE001 (on Ray, too, the others go on whatever it is)
+    except Exception as error:  # on Ray, too, the others go on whatever it is
         done = _stopped(error, reached.iteration)
     return dataclasses.replace(done, messages=reached.messages)
 
