@@ -196,6 +196,11 @@ class RunDir:
         """
         manifest = self.manifest()
         if manifest is not None:
+            if not inside(self.path, "checkpoints").exists():
+                raise RunError(
+                    f"{self.path} is a copy without checkpoints, allowed: a run with them; name the"
+                    " run itself."
+                )
             with self._iterations.advice():
                 manifest.check(self.path, ["config.json", checkpoint_name(iteration)])
         return self.checkpoint(iteration)
