@@ -203,7 +203,7 @@ def evaluate(
     tested = run_tests(
         run_dir, groups=groups, num_episodes=num_episodes, settings=settings, progress=progress
     )
-    rows = episode_rows(tested.config, tested.iteration, tested.trajectories)
+    rows = episode_rows(tested.config, tested.iteration, tested.tests)
     cost = PlanningCost.of(tested.use, tested.config, tested.arena.task)
     return Evaluation(rows, tested.config, cost)
 
