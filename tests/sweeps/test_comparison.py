@@ -10,6 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
+from headway import compare
 from headway.cli import main
 from headway.cli.comparisons import read_seeds, read_settings
 from headway.cli.usage import UsageError
@@ -159,6 +160,48 @@ def test_another_figure_reuses_the_runs(training, tmp_path):
     done = reproduce(comparison(tmp_path, "fig15", seeds=(0,)), workers=HERE)
     assert (before, len(training.calls)) == (2, 2 + 3)
     assert len(done.found.final_points) == 5
+
+
+@pytest.fixture
+def without_figures(monkeypatch):
+    """Figures take long to draw."""
+    monkeypatch.setattr(compare, "draw_comparison", lambda found: [])
+
+
+@pytest.mark.usefixtures("training", "without_figures")
+def test_a_comparison_replaces_what_it_contains_and_nothing_else(tmp_path):
+    board = fakes.Remembering()
+
+    def make(**changes):
+        options = {"seeds": (0,), **changes}
+        done = reproduce(comparison(tmp_path, **options), workers=HERE, board=board)
+        return done.files[-1].parent
+
+    usual = make()
+    assert make() == make(seeds=(0, 1)) == make(seeds=(1, 0), envs=("hopper", "pendulum")) == usual
+    assert board.messages == []
+    both = (usual / "fig13.csv").read_bytes()
+    other = make(envs=("hopper",))
+    assert re.fullmatch(r"fig13-smoke-[0-9a-f]{10}", other.name)
+    assert board.messages == [
+        f"{usual} holds another comparison, which stays; this one goes to {other}"
+    ]
+    horizon = {"planner.horizon": 2}
+    assert len({usual, other, make(envs=("slim-humanoid",)), make(**horizon)}) == 4
+    assert make(envs=("hopper",)) == other
+    assert (usual / "fig13.csv").read_bytes() == both
+    (usual / "comparison.json").write_text("{")
+    assert make(seeds=(0, 1), envs=("pendulum", "hopper")) != usual
+
+
+@pytest.mark.usefixtures("training", "without_figures")
+def test_sweeps_of_the_same_name_do_not_replace_each_other(tmp_path, capsys):
+    words = ("sweep", *WORDS, "--seeds", "0", "--out", str(tmp_path), "--json")
+    files = [
+        json.loads(run(capsys, *words, "--methods", *methods)[1])["files"]
+        for methods in (["pets"], ["pets", "tmcl"], ["mcl"])
+    ]
+    assert files[0] == files[1] != files[2]
 
 
 def test_nothing_finished_makes_no_figure_but_a_table(tmp_path):
