@@ -301,14 +301,21 @@ def test_bad_seeds(word):
 
 def test_settings_are_json_or_text():
     words = ["model.hidden_sizes=[8,8],[9]", "planner.head-selection=average", "a=1,2.5"]
+    words += ['env_options={"x":true,"y":false},{"x":false}', "b=[[1,2],[3]]", "c=1, x,2.y,1e5z"]
     assert read_settings(words) == {
         "model.hidden_sizes": [[8, 8], [9]],
         "planner.head_selection": ["average"],
         "a": [1, 2.5],
+        "env_options": [{"x": True, "y": False}, {"x": False}],
+        "b": [[[1, 2], [3]]],
+        "c": [1, "x", "2.y", "1e5z"],
     }
 
 
-@pytest.mark.parametrize("words", [["a"], ["a="], ["=1"], ["a=1", "a=2"]])
+BAD_SETTINGS = ["a", "a=", "=1", "a=1,", "a=x,,y", "a=,", "a=[8,8", 'a={"x":true', "a=[1]2"]
+
+
+@pytest.mark.parametrize("words", [*([word] for word in BAD_SETTINGS), ["a=1", "a=2"]])
 def test_bad_settings(words):
     with pytest.raises(UsageError, match=r"--settings is"):
         read_settings(words)

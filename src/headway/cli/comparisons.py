@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -189,19 +188,34 @@ def read_settings(words: Sequence[str]) -> dict[str, list[Any]]:
     """
     grid: dict[str, list[Any]] = {}
     for word in words:
-        name, equals, values = word.partition("=")
+        name, equals, text = word.partition("=")
         name = name.lstrip("-").replace("-", "_")
-        parts = re.findall(r"(?:\[[^\]]*\]|[^,\[])+", values)
-        if not (name and equals and parts) or name in grid:
+        values = _values(text)
+        if not (name and equals and values) or name in grid:
             raise UsageError(
-                f"--settings is {word!r}, allowed: NAME=VALUE or NAME=VALUE,VALUE, each name once."
+                f"--settings is {word!r}, allowed: NAME=VALUE or NAME=VALUE,VALUE, each name once;"
+                " lists and tables are JSON."
             )
-        grid[name] = [_value(part) for part in parts]
+        grid[name] = values
     return grid
 
 
-def _value(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text
+def _values(text: str) -> list[Any] | None:
+    """Values between commas; None where one is empty, or begins as JSON and is none."""
+    values: list[Any] = []
+    while True:
+        text = text.strip()
+        try:
+            value, end = json.JSONDecoder().raw_decode(text)
+        except ValueError:
+            value, end = None, -1
+        rest = text[end:].lstrip() if end >= 0 else "?"
+        if rest and not rest.startswith(","):  # it is a word
+            value, comma, rest = text.partition(",")
+            value, rest = value.rstrip(), comma + rest
+            if not value or value[0] in '[{"':
+                return None
+        values.append(value)
+        if not rest:
+            return values
+        text = rest[1:]
