@@ -69,7 +69,10 @@ class Reproduce(_Runs, _Experiment):
     The figure compares the runs; `headway report OUT/runs` shows what is inside each of them.
     """
 
-    settings: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    settings: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(metavar="NAME=VALUE", help_behavior_hint="(default: none)"),
+    ] = ()
     """Settings of every arm, for example collection.num_iterations=3."""
 
 
@@ -82,7 +85,10 @@ class Sweep(_Runs):
 
     methods: tuple[str, ...] = ("tmcl",)
     """Methods; `headway list methods` shows them."""
-    settings: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE[,VALUE...]")] = ()
+    settings: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(metavar="NAME=VALUE[,VALUE...]", help_behavior_hint="(default: none)"),
+    ] = ()
     """Settings with one or several values, for example planner.horizon=10,20."""
     name: str = "sweep"
     """Names the folder of results in --out."""
