@@ -2,6 +2,7 @@
 
 import inspect
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -168,3 +169,16 @@ def test_no_file_holds_the_marks_of_an_unfinished_merge():
         if page.suffix in {".py", ".md", ".toml", ".txt", ".csv", ".json"}:
             marked = [line for line in page.read_text().splitlines() if line.startswith(marks)]
             assert not marked, f"{page} holds the marks of an unfinished merge: {marked}"
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_make_clean_removes_caches_and_nothing_else(tmp_path):
+    for folder in ROOT.iterdir():
+        if folder.is_dir() and not folder.name.startswith("."):
+            (tmp_path / folder.name / "inside").mkdir(parents=True)
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    kept = sorted(path for path in tmp_path.rglob("*") if "build" not in path.parts)
+    (tmp_path / "src" / "inside" / "__pycache__").mkdir()
+    done = subprocess.run(["make", "clean"], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert sorted(tmp_path.rglob("*")) == kept

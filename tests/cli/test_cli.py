@@ -331,6 +331,20 @@ def test_help_says_what_is_not_given(capsys, words, says):
     assert says in " ".join(out.replace("│", " ").split())
 
 
+def test_results_print_in_a_line(calls):
+    trained = api.train("pendulum", method="tmcl", preset="quick")
+    text = repr(trained)
+    assert text.startswith(f"Run({str(trained.path)!r}: tmcl on pendulum, seed 0, 2 iterations; ")
+    assert "train -128.5" in text  # without the earlier iteration
+    tested = repr(api.evaluate(trained.path))
+    assert re.fullmatch(
+        r"Evaluation\(tmcl on pendulum, 4 episodes; train -128.5 \(score \d.\d\d\);"
+        r" unseen -1,091.0 \(score -\d.\d\d\)\)",
+        tested,
+    )
+    assert "\n" not in text + tested
+
+
 def test_plot_dynamics(capsys, tmp_path):
     out_file = tmp_path / "deep" / "picture.png"
     words = ("plot-dynamics", "pendulum", "-o", str(out_file), "--num-states", "5", "--json")
