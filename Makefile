@@ -77,7 +77,7 @@ constraints: ## Rewrite constraints.txt from fresh installs of the newest versio
 clean: ## Remove caches and build leftovers; keeps .venv, runs and saved results
 	@rm -rf build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks
 	@rm -rf $(VENV)-constraints benchmarks/latest MUJOCO_LOG.TXT
-	@find src tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} +
+	@find src tests benchmarks results -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # pip exists only where venv succeeded; a .venv that somebody else made is used as it is.
 $(VENV)/main.stamp: $(SPECS)

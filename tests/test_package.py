@@ -2,6 +2,7 @@
 
 import inspect
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -85,7 +86,7 @@ def test_wheel_holds_the_package_and_its_type_marker(tmp_path):
     }
 
 
-@pytest.mark.parametrize("folder", ["src", "tests", "benchmarks", "examples"])
+@pytest.mark.parametrize("folder", ["src", "tests", "benchmarks", "results"])
 def test_no_file_is_over_400_lines(folder):
     lengths = {
         str(path.relative_to(ROOT)): len(path.read_text().splitlines())
@@ -168,3 +169,16 @@ def test_no_file_holds_the_marks_of_an_unfinished_merge():
         if page.suffix in {".py", ".md", ".toml", ".txt", ".csv", ".json"}:
             marked = [line for line in page.read_text().splitlines() if line.startswith(marks)]
             assert not marked, f"{page} holds the marks of an unfinished merge: {marked}"
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+def test_make_clean_removes_caches_and_nothing_else(tmp_path):
+    for folder in ROOT.iterdir():
+        if folder.is_dir() and not folder.name.startswith("."):
+            (tmp_path / folder.name / "inside").mkdir(parents=True)
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    left_over = {"build", "dist"}
+    kept = sorted(path for path in tmp_path.rglob("*") if not left_over & set(path.parts))
+    (tmp_path / "src" / "inside" / "__pycache__").mkdir()
+    subprocess.run(["make", "clean"], cwd=tmp_path, check=True, capture_output=True)
+    assert sorted(tmp_path.rglob("*")) == kept

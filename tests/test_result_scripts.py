@@ -1,15 +1,25 @@
-"""The scripts behind `results/adaptation`: they run, go on where they were, and tell arms apart."""
+"""The scripts behind `results/`: they run, go on where they were, and tell arms apart."""
 
+import re
 import runpy
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
 
 import headway
+from headway import settings
+from headway.cli import main
+from headway.errors import RunError
+from headway.storage import config_file
 from headway.storage.records import read_csv
+from headway.storage.run_dir import RunDir
+from headway.storage.tables import TABLES
 
-SCRIPTS = Path(__file__).parents[1] / "results" / "adaptation"
+RESULTS = Path(__file__).parents[1] / "results"
+SCRIPTS = RESULTS / "adaptation"
+FINISHED = RESULTS / "pendulum-quick" / "tmcl" / "seed-0"
 
 
 @pytest.fixture(scope="module")
@@ -86,3 +96,59 @@ def test_a_drift_goes_to_its_end_in_equal_steps():
     assert lengths(1.0, 0.5).schedule(20) == {20: {"length": 0.5}}
     drift = lengths(0.5, 1.5, over=4).schedule(20)
     assert drift == {20 + i: {"length": 0.75 + 0.25 * i} for i in range(4)}
+
+
+@pytest.fixture
+def keep():
+    """The function of `results/keep.py`."""
+    return runpy.run_path(str(RESULTS / "keep.py"))["keep"]
+
+
+def variant(path, **changes):
+    """A finished run of other settings; only what is kept of it is there."""
+    shutil.copytree(FINISHED, path)
+    config = settings.override(RunDir(path).config(), changes)
+    (path / "config.json").write_bytes(config_file.content(config))
+    return RunDir(path)
+
+
+def test_what_is_kept_of_a_run_can_be_reported_but_not_used(keep, tmp_path, capsys):
+    kept = keep(RunDir(FINISHED), tmp_path / "kept")
+    assert kept == tmp_path / "kept" / "tmcl" / "seed-0"
+    names = {path.relative_to(kept).as_posix() for path in kept.rglob("*") if path.is_file()}
+    assert "manifests/iteration-004.json" in names
+    assert not any(name.startswith(("checkpoints", "data", "tests")) for name in names)
+    assert len(RunDir(kept).metrics()) == 5
+    out = tmp_path / "report.html"
+    words = ["report", str(kept), "-o", str(out), "--only", "results", "contexts"]
+    assert main(words) == 0
+    page = out.read_text()
+    assert "iterations are finished" not in page
+    assert "seed-0 is a copy without checkpoints, allowed: a run with them" in page
+    with pytest.raises(RunError, match="is a copy without checkpoints"):
+        headway.load(kept)
+
+
+def test_another_variant_is_kept_beside(keep, tmp_path):
+    run = variant(tmp_path / "faster", **{"fitting.learning_rate": 5e-4})
+    averaged = variant(tmp_path / "averaged", **{"planner.head_selection": "average"})
+    folder = tmp_path / "kept"
+    names = [keep(one, folder).parent.name for one in (RunDir(FINISHED), run, averaged)]
+    assert names[0] == "tmcl"
+    assert re.fullmatch(r"tmcl-[0-9a-f]{10}", names[1])
+    assert names[2] == "tmcl-average"
+    assert keep(run, folder).parent.name == names[1]
+    shutil.copyfile(run.path / "config.json", folder / "tmcl" / "seed-0" / "config.json")
+    with pytest.raises(SystemExit, match=r"is of another run .*fitting.learning_rate"):
+        keep(RunDir(FINISHED), folder)
+
+
+def test_what_was_kept_can_be_read():
+    runs = sorted((RESULTS / "pendulum-quick").glob("*/seed-*"))
+    assert len(runs) == 27
+    for path in runs:
+        run = RunDir(path)
+        assert run.finished_iterations == run.config().collection.num_iterations == 5
+        manifest = run.manifest()
+        assert manifest is not None
+        manifest.check(path, ["config.json", *TABLES])

@@ -39,6 +39,14 @@ class Run:
         """The trained controller; options are those of `load`."""
         return load(self.path, seed=seed, **options)
 
+    def __repr__(self) -> str:
+        """Where it is and how its last tests went; its fields say more."""
+        config, last = self.config, max((row.iteration for row in self.evaluation), default=0)
+        tests = [row for row in self.evaluation if row.iteration == last]
+        what = f"{config.method} on {config.env}, seed {config.seed}"
+        what += f", {len(self.metrics)} iterations{_told(tests, config)}"
+        return f"Run({str(self.path)!r}: {what})"
+
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation(Sequence[EpisodeRow]):
@@ -60,6 +68,22 @@ class Evaluation(Sequence[EpisodeRow]):
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    def __repr__(self) -> str:
+        """How each group went; the fields say more."""
+        what = f"{self.config.method} on {self.config.env}, {len(self)} episodes"
+        return f"Evaluation({what}{_told(self.rows, self.config)})"
+
+
+def _told(rows: Sequence[EpisodeRow], config: Config) -> str:
+    """Mean return and score of each group in a few words."""
+    from headway.report.tables import by_group
+
+    text = ""
+    for group in by_group(rows, config):
+        score = "" if group["score"] is None else f" (score {group['score']:.2f})"
+        text += f"; {group['group']} {group['return_mean']:,.1f}{score}"
+    return text
 
 
 def train(  # noqa: PLR0913 (keywords, all with a default)
@@ -203,7 +227,7 @@ def evaluate(
     tested = run_tests(
         run_dir, groups=groups, num_episodes=num_episodes, settings=settings, progress=progress
     )
-    rows = episode_rows(tested.config, tested.iteration, tested.trajectories)
+    rows = episode_rows(tested.config, tested.iteration, tested.tests)
     cost = PlanningCost.of(tested.use, tested.config, tested.arena.task)
     return Evaluation(rows, tested.config, cost)
 

@@ -9,6 +9,7 @@ from headway.report.comparison.runs import Found, find
 from headway.report.comparison.writing import write_raw, write_table
 from headway.sweeps.board import Board
 from headway.sweeps.jobs import Comparison
+from headway.sweeps.results_folder import claim
 from headway.sweeps.running import Workers, run_jobs
 
 
@@ -34,7 +35,8 @@ def reproduce(
     """Make every run of a comparison that is missing, and write figure, CSV and table.
 
     Begun runs go on where they stand, finished ones are used as they are, also by other
-    experiments with the same `out`.
+    experiments with the same `out`. Figure, CSV and table replace those of the same comparison
+    with fewer environments, seeds or arms, and no others.
 
     Args:
         comparison: The experiment, environments, seeds and scale.
@@ -47,8 +49,14 @@ def reproduce(
         ConfigError: A setting is unknown, of the wrong type or out of range.
     """
     with board or Board() as shown:
+        if comparison.folder != comparison.usual_folder:
+            shown.message(
+                f"{comparison.usual_folder} holds another comparison, which stays; this one goes to"
+                f" {comparison.folder}"
+            )
         run_jobs(comparison.jobs, workers or Workers(), shown)
         failures = dict(shown.failures)
     found = find(comparison)
+    claim(comparison.folder, comparison.facts)
     files = [*draw_comparison(found), write_raw(found), write_table(found, command)]
     return Reproduced(found, files, failures)

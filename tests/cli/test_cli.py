@@ -12,7 +12,7 @@ from headway.cli.commands import COMMANDS, parse_train
 from headway.errors import RunError
 from headway.experiment.evaluation import PlanningCost
 from headway.experiment.methods import METHODS, PRESETS, make_config
-from headway.settings import override
+from headway.settings import flatten, override, to_dict
 from headway.storage.interrupts import Terminated
 from headway.storage.run_dir import RunDir
 from headway.storage.tables import EpisodeRow
@@ -307,6 +307,42 @@ def test_list(capsys, what, names):
     assert out.count("\n") == 1
     listed = [entry["name"] for entry in json.loads(out)[what]]
     assert set(names) <= set(listed)
+
+
+def test_settings_of_methods_are_those_that_differ(capsys):
+    entries = json.loads(run(capsys, "list", "methods", "--json")[1])["methods"]
+    usual = flatten(to_dict(make_config("pendulum")))
+    assert all(usual[n] != value for entry in entries for n, value in entry["settings"].items())
+    by_name = {entry["name"]: entry["settings"] for entry in entries}
+    assert by_name["cadm"]["model.context_at"] == "input"
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["sweep"], "for example planner.horizon=10,20. (default: none)"),
+        (["reproduce"], "for example collection.num_iterations=3. (default: none)"),
+        (["train", "--preset", "quick"], "Name ENV first"),
+    ],
+)
+def test_help_says_what_is_not_given(capsys, words, says):
+    code, out, _ = run(capsys, *words, "--help")
+    assert code == 0
+    assert says in " ".join(out.replace("│", " ").split())
+
+
+def test_results_print_in_a_line(calls):
+    trained = api.train("pendulum", method="tmcl", preset="quick")
+    text = repr(trained)
+    assert text.startswith(f"Run({str(trained.path)!r}: tmcl on pendulum, seed 0, 2 iterations; ")
+    assert "train -128.5" in text  # without the earlier iteration
+    tested = repr(api.evaluate(trained.path))
+    assert re.fullmatch(
+        r"Evaluation\(tmcl on pendulum, 4 episodes; train -128.5 \(score \d.\d\d\);"
+        r" unseen -1,091.0 \(score -\d.\d\d\)\)",
+        tested,
+    )
+    assert "\n" not in text + tested
 
 
 def test_plot_dynamics(capsys, tmp_path):

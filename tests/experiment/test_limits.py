@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -35,6 +36,15 @@ def test_a_run_that_does_not_fit_is_refused_with_the_numbers(monkeypatch, tmp_pa
             run_dir=tmp_path / "run",
             settings={"planner.num_candidates": 10**8},
         )
+
+
+def test_what_cannot_ignore_the_limits_is_not_advised_to(monkeypatch):
+    run = Path(__file__).parents[1] / "data" / "run-schema-2"
+    monkeypatch.setattr(limits, "free_memory", lambda: 3 * GIB)
+    monkeypatch.setattr(limits, "resident", lambda: 0)
+    with pytest.raises(LimitError, match=r"choose smaller sizes or fewer candidates") as raised:
+        api.evaluate(run, settings={"planner.num_candidates": 10**8})
+    assert "ignore" not in str(raised.value)
 
 
 @pytest.fixture

@@ -117,7 +117,14 @@ def test_the_display_fits_the_stream(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("seconds", "text"), [(59, "59 s"), (200, "3 min 20 s"), (7500, "2 h 5 min")]
+    ("seconds", "text"),
+    [
+        (59, "59 s"),
+        (200, "3 min 20 s"),
+        (7500, "2 h 5 min"),
+        (172_799.4, "47 h 59 min"),
+        (1291 * 3600 + 25 * 60, "53 d 19 h"),
+    ],
 )
 def test_durations(seconds, text):
     assert duration(seconds) == text

@@ -2,6 +2,7 @@
 
 import ast
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from headway.errors import LimitError, RunError
 from headway.experiment import training
 from headway.report.figures import save_run_figures
 from headway.storage import files
+from headway.storage.iterations import Iterations
 from headway.storage.manifest import Manifest
 from headway.storage.run_dir import RunDir
 
@@ -45,6 +47,23 @@ def test_a_run_of_every_schema_is_read(sample):
     assert save_run_figures(sample)
     action = headway.load(sample).act(np.array([1.0, 0.0, 0.0]))
     assert action.shape == (1,)
+
+
+def test_a_run_is_read_while_an_iteration_is_finished(root, tmp_path, monkeypatch):
+    newer = root / "manifests" / "iteration-001.json"
+    hidden = newer.rename(tmp_path / "newer.json")
+    newest = Iterations.newest
+
+    def then_finished(self):
+        found = newest(self)
+        if hidden.exists():
+            hidden.rename(newer)
+        return found
+
+    monkeypatch.setattr(Iterations, "newest", then_finished)
+    assert [row["iteration"] for row in RunDir(root).metrics()] == [0]
+    assert newer.exists()
+    assert len(RunDir(root).metrics()) == 2
 
 
 def test_a_run_of_every_schema_goes_on(sample):
@@ -176,6 +195,22 @@ def test_a_full_disk_is_noticed_before_anything_is_written(root, monkeypatch):
 
 PICKLES = {"pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve", "yaml", "torch"}
 EVALUATING = {"eval", "exec", "compile", "__import__"}
+
+
+@pytest.mark.parametrize("name", ["fifo", "folder", ".", "link"])
+def test_only_regular_files_are_replaced(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("fifo")
+    Path("folder").mkdir()
+    Path("link").symlink_to("fifo")
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(RunError, match=r"is no regular file, allowed: .*; choose another name\.$"):
+        files.write_bytes(Path(name), b"content")
+    assert sorted(tmp_path.iterdir()) == before
+    assert Path("fifo").is_fifo()
+    files.write_bytes(Path("file"), b"content")
+    files.write_bytes(Path("file"), b"other")
+    assert Path("file").read_bytes() == b"other"
 
 
 def test_nothing_in_the_package_can_turn_a_file_into_code():

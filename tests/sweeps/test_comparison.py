@@ -11,6 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
+from headway import compare
 from headway.cli import main
 from headway.cli.comparisons import read_seeds, read_settings
 from headway.cli.usage import UsageError
@@ -213,6 +214,48 @@ def test_another_figure_reuses_the_runs(training, tmp_path):
     assert len(done.found.final_points) == 5
 
 
+@pytest.fixture
+def without_figures(monkeypatch):
+    """Figures take long to draw."""
+    monkeypatch.setattr(compare, "draw_comparison", lambda found: [])
+
+
+@pytest.mark.usefixtures("training", "without_figures")
+def test_a_comparison_replaces_what_it_contains_and_nothing_else(tmp_path):
+    board = fakes.Remembering()
+
+    def make(**changes):
+        options = {"seeds": (0,), **changes}
+        done = reproduce(comparison(tmp_path, **options), workers=HERE, board=board)
+        return done.files[-1].parent
+
+    usual = make()
+    assert make() == make(seeds=(0, 1)) == make(seeds=(1, 0), envs=("hopper", "pendulum")) == usual
+    assert board.messages == []
+    both = (usual / "fig13.csv").read_bytes()
+    other = make(envs=("hopper",))
+    assert re.fullmatch(r"fig13-smoke-[0-9a-f]{10}", other.name)
+    assert board.messages == [
+        f"{usual} holds another comparison, which stays; this one goes to {other}"
+    ]
+    horizon = {"planner.horizon": 2}
+    assert len({usual, other, make(envs=("slim-humanoid",)), make(**horizon)}) == 4
+    assert make(envs=("hopper",)) == other
+    assert (usual / "fig13.csv").read_bytes() == both
+    (usual / "comparison.json").write_text("{")
+    assert make(seeds=(0, 1), envs=("pendulum", "hopper")) != usual
+
+
+@pytest.mark.usefixtures("training", "without_figures")
+def test_sweeps_of_the_same_name_do_not_replace_each_other(tmp_path, capsys):
+    words = ("sweep", *WORDS, "--seeds", "0", "--out", str(tmp_path), "--json")
+    files = [
+        json.loads(run(capsys, *words, "--methods", *methods)[1])["files"]
+        for methods in (["pets"], ["pets", "tmcl"], ["mcl"])
+    ]
+    assert files[0] == files[1] != files[2]
+
+
 def test_nothing_finished_makes_no_figure_but_a_table(tmp_path):
     found = find(comparison(tmp_path))
     assert len(found.missing) == 6
@@ -310,6 +353,9 @@ def test_dry_run_lists_and_runs_nothing(training, tmp_path, capsys):
     facts = json.loads(out)
     assert [entry["state"] for entry in facts["runs"]] == ["waiting"] * 5
     assert facts["runs"][0]["arms"] == ["M = 1"]
+    assert facts["note"] == ""
+    words = ("reproduce", "comparison", *words[2:])
+    assert "missing runs that plan on the true dynamics" in run(capsys, *words)[1]
     assert training.calls == []
     assert list(tmp_path.iterdir()) == []
 
@@ -347,14 +393,21 @@ def test_bad_seeds(word):
 
 def test_settings_are_json_or_text():
     words = ["model.hidden_sizes=[8,8],[9]", "planner.head-selection=average", "a=1,2.5"]
+    words += ['env_options={"x":true,"y":false},{"x":false}', "b=[[1,2],[3]]", "c=1, x,2.y,1e5z"]
     assert read_settings(words) == {
         "model.hidden_sizes": [[8, 8], [9]],
         "planner.head_selection": ["average"],
         "a": [1, 2.5],
+        "env_options": [{"x": True, "y": False}, {"x": False}],
+        "b": [[[1, 2], [3]]],
+        "c": [1, "x", "2.y", "1e5z"],
     }
 
 
-@pytest.mark.parametrize("words", [["a"], ["a="], ["=1"], ["a=1", "a=2"]])
+BAD_SETTINGS = ["a", "a=", "=1", "a=1,", "a=x,,y", "a=,", "a=[8,8", 'a={"x":true', "a=[1]2"]
+
+
+@pytest.mark.parametrize("words", [*([word] for word in BAD_SETTINGS), ["a=1", "a=2"]])
 def test_bad_settings(words):
     with pytest.raises(UsageError, match=r"--settings is"):
         read_settings(words)

@@ -138,6 +138,55 @@ def test_what_still_runs_is_told_to_save_when_the_driver_stops(ray_of, tmp_path)
     assert fake.cancelled == [2]
 
 
+def connecting(fake, error=None):
+    """Lets a fake Ray be started or joined; returns what it was told."""
+    told = []
+
+    def init(address, **options):
+        told.append((address, options))
+        if error is not None:
+            raise error
+
+    fake.is_initialized = lambda: False
+    fake.init = init
+    fake.shutdown = lambda: told.append("shutdown")
+    return told
+
+
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (
+            ConnectionError("nobody\nanswers"),
+            r"no Ray cluster at address '1.2.3.4:5' .*nobody answers",
+        ),
+        (RuntimeError("Version mismatch:\n  Ray: 2.1"), r"Version mismatch: Ray: 2.1\); a cluster"),
+    ],
+)
+def test_a_cluster_that_cannot_be_joined_is_told_in_one_line(ray_of, error, says):
+    connecting(ray_of(), error)
+    with pytest.raises(ConfigError, match=says) as raised, on_ray._connected("1.2.3.4:5"):
+        pass
+    assert "\n" not in str(raised.value)
+
+
+def test_the_ray_of_another_sweep_is_left_alone(ray_of):
+    fake = ray_of()
+    told = connecting(fake)
+    fake.nodes = list
+    with on_ray._connected(None):
+        (_, options), *_ = told
+    node = {"Alive": True, "Resources": {"CPU": 2.0, **options["resources"]}}
+    fake.nodes = lambda: [node]
+    with pytest.raises(ConfigError, match="belongs to another sweep"), on_ray._connected("auto"):
+        pass
+    assert told[1:] == ["shutdown", ("auto", told[2][1]), "shutdown"]
+    assert "resources" not in told[2][1]
+    fake.nodes = lambda: [{"Alive": True, "Resources": {"CPU": 2.0}}]
+    with on_ray._connected("auto"):
+        pass
+
+
 def nodes(*resources, alive=True):
     return [
         {"Alive": alive, "Resources": dict(zip(("CPU", "GPU"), r, strict=True))} for r in resources

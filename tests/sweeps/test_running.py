@@ -1,21 +1,22 @@
 """Missing runs are made once each, whatever happens to some of them."""
 
 import io
+import itertools
 import shutil
 from pathlib import Path
 
 import fakes
+import jax
 import pytest
 from rich.console import Console
 
 from headway.errors import ConfigError, RunError, SeedsError
-from headway.experiment.loading import load_task
-from headway.planning.flop import plan_flop
+from headway.experiment import seeds
+from headway.experiment.methods import make_config
 from headway.storage.run_dir import RunDir
-from headway.storage.run_lock import locked
+from headway.storage.run_lock import LOCK, locked
 from headway.sweeps import running
-from headway.sweeps.board import PlainBoard
-from headway.sweeps.cost import make_plan, run_flop
+from headway.sweeps.board import PlainBoard, describe
 from headway.sweeps.jobs import Job
 from headway.sweeps.live_board import LiveBoard
 from headway.sweeps.running import Workers, run_jobs
@@ -39,7 +40,7 @@ def test_runs_are_made_in_order_and_only_once(training, tmp_path, monkeypatch):
     run_jobs(jobs, HERE, board)
     assert [seed for _, seed in training.calls] == [2, 0, 1]
     assert all(status.state == "done" for status in board.statuses.values())
-    assert board.states(jobs[0]) == ["running", "running", "running", "done"]
+    assert board.states(jobs[0]) == ["running", "running", "done"]
     again = fakes.Remembering()
     run_jobs([*jobs, fakes.tiny_job(tmp_path, 3)], HERE, again)
     assert [seed for _, seed in training.calls] == [2, 0, 1, 3]
@@ -97,13 +98,67 @@ def test_what_the_other_process_finished_is_not_made_again(training, tmp_path, m
     assert len(training.calls) == 1
 
 
-def test_a_held_directory_is_busy(tmp_path):
+def test_a_held_directory_is_busy_and_that_is_said_once(tmp_path, monkeypatch):
     job = fakes.tiny_job(tmp_path)
     job.path.mkdir(parents=True)
+    stream, tries = io.StringIO(), itertools.count(1)
+
+    def sleep(_):
+        if next(tries) == 3:
+            fakes.write_run(job.config, job.path)
+
+    monkeypatch.setattr(running.time, "sleep", sleep)
     with locked(job.path):
-        status = running.make_run(job, lambda _: None)
-    assert status.state == "busy"
-    assert "another process" in status.note
+        run_jobs([job], HERE, PlainBoard(stream))
+    _, busy, done = stream.getvalue().splitlines()
+    assert "busy  0/2" in busy
+    assert "another process" in busy
+    assert "done  2/2" in done
+
+
+def test_an_error_that_is_not_headways_does_not_stop_the_others(training, tmp_path, monkeypatch):
+    def held(config, path, progress):
+        with RunDir(path).locked():
+            training(config, path, progress)
+
+    monkeypatch.setattr(running, "train_run", held)
+    jobs = [fakes.tiny_job(tmp_path, seed) for seed in (0, 1)]
+    fakes.write_run(jobs[0].config, jobs[0].path)
+    (jobs[0].path / "metrics.jsonl").unlink()
+    (jobs[0].path / LOCK).mkdir(parents=True)
+    board = fakes.Remembering()
+    run_jobs(jobs, HERE, board)
+    assert board.failures.keys() == {jobs[0].path}
+    assert "IsADirectoryError" in board.failures[jobs[0].path]
+    assert jobs[1].finished
+
+
+def test_memory_that_runs_out_together_lets_each_seed_try_alone(training, tmp_path, monkeypatch):
+    def too_large(*args, **options):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory\nallocating 9 GiB")
+
+    monkeypatch.setattr(running, "train_seeds", too_large)
+    training.answers = {0: [jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: again")]}
+    jobs = [fakes.tiny_job(tmp_path, seed) for seed in (0, 1)]
+    board = fakes.Remembering()
+    run_jobs(jobs, Workers(seeds_together=True), board)
+    assert [text.endswith("Out of memory allocating 9 GiB") for text in board.messages] == [True]
+    assert [note.endswith("again") for note in board.failures.values()] == [True]
+    assert jobs[1].finished
+
+
+def test_a_busy_seed_that_learns_nothing_is_tried_again(training, tmp_path, monkeypatch):
+    jobs = [
+        Job.of(make_config("pendulum", method="random", preset="smoke", seed=seed), tmp_path)
+        for seed in (0, 1)
+    ]
+    monkeypatch.setattr(seeds, "train_run", training)
+    training.answers = {0: [fakes.BUSY]}
+    board = fakes.Remembering()
+    run_jobs(jobs, Workers(seeds_together=True), board)
+    assert training.calls == [("random", 0), ("random", 1), ("random", 0)]
+    assert board.failures == {}
+    assert [state for state in board.states(jobs[0]) if state != "running"] == ["busy", "done"]
 
 
 def test_without_ray_it_says_what_to_install(training, tmp_path, monkeypatch):
@@ -179,6 +234,9 @@ def test_seeds_that_cannot_be_begun_together_go_one_by_one(training, tmp_path, m
         {"gpus_per_run": -1},
         {"one_by_one": True, "address": "auto"},
         {"seeds_together": True, "address": "auto"},
+        {"one_by_one": True, "cpus_per_run": 2},
+        {"seeds_together": True, "gpus_per_run": 0},
+        {"gpus_per_run": 1.5},
     ],
 )
 def test_impossible_workers_are_refused(wrong):
@@ -190,7 +248,9 @@ def test_status_follows_a_run_and_reports_seldom():
     now = [0.0]
     told = []
     progress = StatusProgress(told.append, 1, clock=lambda: now[0])
-    assert told[-1] == Status("running", 1, "preparing")
+    assert told == []
+    with progress:
+        assert told == [Status("running", 1, "preparing")]
     progress.phase(1, 3, "collect", 10)
     for _ in range(10):
         now[0] += 0.2
@@ -200,6 +260,35 @@ def test_status_follows_a_run_and_reports_seldom():
     metrics = {"iteration": 1, "collection": {"return_mean": -5.0, "return_std": 1.0}}
     progress.iteration_done(metrics)
     assert (told[-1].iteration, told[-1].returns) == (2, "collected -5 ± 1")
+    progress.message("the fit goes back")
+    progress.message("the episode is dropped")
+    assert told[-1].messages == ("the fit goes back", "the episode is dropped")
+    assert told[-1].iteration == 2
+
+
+def test_what_a_run_says_is_shown_once_and_named(training, tmp_path, monkeypatch):
+    def talking(config, path, progress):
+        with progress:
+            progress.message("an episode is dropped")
+            progress.message("a fit begins anew")
+        training(config, path, progress)
+
+    monkeypatch.setattr(running, "train_run", talking)
+    job = fakes.tiny_job(tmp_path)
+    board = fakes.Remembering()
+    run_jobs([job], HERE, board)
+    assert board.messages == [
+        f"{describe(job)}: {text}" for text in ("an episode is dropped", "a fit begins anew")
+    ]
+
+
+def test_a_message_that_was_lost_on_its_way_comes_with_the_next_report(tmp_path):
+    board = fakes.Remembering()
+    job = fakes.tiny_job(tmp_path)
+    board.begin([job])
+    board.tell(job, Status("running", 0, messages=("one",)))
+    board.tell(job, Status("done", 2, messages=("one", "two", "three")))
+    assert [text.rpartition(" ")[2] for text in board.messages] == ["one", "two", "three"]
 
 
 def test_reports_after_the_end_change_nothing(tmp_path):
@@ -245,39 +334,3 @@ def test_the_live_table_shows_every_run_and_the_busiest_first(tmp_path):
         "3", "min", "20", "s",
     ]  # fmt: skip
     assert lines[-1].strip() == "6 runs: 1 running, 4 waiting, 1 done; 2 not shown"
-
-
-def test_an_estimate_counts_what_is_missing_at_the_speed_of_what_is_done(tmp_path):
-    jobs = [fakes.tiny_job(tmp_path, seed) for seed in range(3)]
-    plan = make_plan(jobs)
-    assert [one.state for one in plan.jobs] == ["waiting"] * 3
-    assert "just now" in plan.source
-    fakes.write_run(jobs[0].config, jobs[0].path)
-    plan = make_plan(jobs)
-    assert [one.state for one in plan.jobs] == ["done", "waiting", "waiting"]
-    # The fake run says that it took 4 seconds per iteration, and has 2.
-    assert plan.seconds() == pytest.approx(16.0)
-    assert plan.source == "1 finished runs"
-
-
-def test_arithmetic_of_a_run_follows_its_settings(tmp_path):
-    def flop(first_iteration=0, **changes):
-        return run_flop(fakes.tiny_job(tmp_path, **changes).config, first_iteration)
-
-    whole = flop()
-    assert 0 < flop(1) < whole
-    assert flop(2) == 0
-    # Pendulum has two unseen groups of two episodes of six steps, tested twice, the training
-    # physics once, and collects two planned episodes; the rest is fitting.
-    steps = (2 * 2 + 1) * 2 * 6 + 2 * 6
-    config = fakes.tiny_job(tmp_path).config
-    fitting = whole - steps * plan_flop(config.model, config.planner, load_task(config))
-    assert flop(**{"fitting.epochs": 2}) == pytest.approx(whole + fitting)
-    # After the last iteration, which has two thirds of the passes; each update sees an episode.
-    extra = fitting * 2 / 3 * (1 + 6 / config.fitting.batch_size)
-    assert flop(**{"fitting.adaptation_epochs": 1}) == pytest.approx(whole + extra)
-    always = flop(**{"evaluation.training_group": "always"})  # once more, after iteration 0
-    assert always - whole == pytest.approx((whole - fitting) / steps * 2 * 6)
-    seldom = {"evaluation.training_group": "always", "evaluation.every": 2}
-    assert flop(**seldom) == flop(**{"evaluation.every": 2})
-    assert flop(**{"planner.horizon": 6}) == pytest.approx(2 * whole - fitting)

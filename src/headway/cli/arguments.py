@@ -90,7 +90,8 @@ def changed_settings(arguments: WithSettings, default: WithSettings) -> dict[str
 class Train:
     """Train a controller on an environment whose physics vary; resume if it was begun before.
 
-    The defaults shown are those of the environment, method and preset named before --help.
+    The defaults shown are those of the environment, method and preset named before --help. Name
+    ENV first: without it they are those of the preset paper.
     """
 
     env: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ENV")]

@@ -138,10 +138,12 @@ def plot_dynamics(words: Sequence[str]) -> int:
     if arguments.num_states < 1:
         raise UsageError(f"--num-states is {arguments.num_states}, allowed: at least 1.")
     from headway.report import dynamics
+    from headway.storage.files import check_target
     from headway.tasks.catalog import env_spec
 
     name = env_spec(arguments.env).name
     out = arguments.output or Path(f"{name}-dynamics.png")
+    check_target(out)
     path = dynamics.plot_dynamics(name, out, num_states=arguments.num_states, seed=arguments.seed)
     if arguments.json:
         return _print_json({"env": name, "figure": str(path)})

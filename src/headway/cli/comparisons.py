@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -70,7 +69,10 @@ class Reproduce(_Runs, _Experiment):
     The figure compares the runs; `headway report OUT/runs` shows what is inside each of them.
     """
 
-    settings: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE")] = ()
+    settings: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(metavar="NAME=VALUE", help_behavior_hint="(default: none)"),
+    ] = ()
     """Settings of every arm, for example collection.num_iterations=3."""
 
 
@@ -83,7 +85,10 @@ class Sweep(_Runs):
 
     methods: tuple[str, ...] = ("tmcl",)
     """Methods; `headway list methods` shows them."""
-    settings: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE[,VALUE...]")] = ()
+    settings: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(metavar="NAME=VALUE[,VALUE...]", help_behavior_hint="(default: none)"),
+    ] = ()
     """Settings with one or several values, for example planner.horizon=10,20."""
     name: str = "sweep"
     """Names the folder of results in --out."""
@@ -173,10 +178,11 @@ def _print_plan(comparison: "Comparison", as_json: bool) -> int:
     from headway.report.comparison.terminal import plan
     from headway.sweeps.cost import make_plan
 
-    entries, table = plan(comparison, make_plan(comparison.jobs))
+    planned = make_plan(comparison.jobs)
+    entries, table = plan(comparison, planned)
     if as_json:
-        return print_json(entries)
-    print_tables(table)
+        return print_json({**entries, "note": planned.note})
+    print_tables(table, *[planned.note] * bool(planned.note))
     return 0
 
 
@@ -188,19 +194,34 @@ def read_settings(words: Sequence[str]) -> dict[str, list[Any]]:
     """
     grid: dict[str, list[Any]] = {}
     for word in words:
-        name, equals, values = word.partition("=")
+        name, equals, text = word.partition("=")
         name = name.lstrip("-").replace("-", "_")
-        parts = re.findall(r"(?:\[[^\]]*\]|[^,\[])+", values)
-        if not (name and equals and parts) or name in grid:
+        values = _values(text)
+        if not (name and equals and values) or name in grid:
             raise UsageError(
-                f"--settings is {word!r}, allowed: NAME=VALUE or NAME=VALUE,VALUE, each name once."
+                f"--settings is {word!r}, allowed: NAME=VALUE or NAME=VALUE,VALUE, each name once;"
+                " lists and tables are JSON."
             )
-        grid[name] = [_value(part) for part in parts]
+        grid[name] = values
     return grid
 
 
-def _value(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text
+def _values(text: str) -> list[Any] | None:
+    """Values between commas; None where one is empty, or begins as JSON and is none."""
+    values: list[Any] = []
+    while True:
+        text = text.strip()
+        try:
+            value, end = json.JSONDecoder().raw_decode(text)
+        except ValueError:
+            value, end = None, -1
+        rest = text[end:].lstrip() if end >= 0 else "?"
+        if rest and not rest.startswith(","):  # it is a word
+            value, comma, rest = text.partition(",")
+            value, rest = value.rstrip(), comma + rest
+            if not value or value[0] in '[{"':
+                return None
+        values.append(value)
+        if not rest:
+            return values
+        text = rest[1:]

@@ -8,7 +8,7 @@ PIPE_WIDTH = 130
 
 
 def print_tables(*tables: Any) -> None:
-    """Print rich tables, as wide as the terminal."""
+    """Print rich tables, or text, as wide as the terminal."""
     from rich.console import Console
 
     console = Console(width=None if sys.stdout.isatty() else PIPE_WIDTH, highlight=False)

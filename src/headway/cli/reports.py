@@ -16,7 +16,9 @@ def report(words: Sequence[str]) -> int:
     if not arguments.runs:
         raise UsageError("missing argument RUN. `headway report --help` explains.")
     from headway.report.page.build import write_report
+    from headway.storage.files import check_target
 
+    check_target(arguments.output)
     path = write_report(arguments.runs, arguments.output, only=arguments.only)
     if arguments.json:
         return print_json({"report": str(path)})
@@ -49,7 +51,9 @@ def record(words: Sequence[str]) -> int:
     arguments, settings = parse_for_run(Record(run=tyro.MISSING), words, "headway record")
     from headway.experiment.progress import make_progress
     from headway.report import recording
+    from headway.storage.files import check_target
 
+    check_target(arguments.output)
     found = recording.record(
         arguments.run,
         arguments.output,

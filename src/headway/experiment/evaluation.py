@@ -29,6 +29,10 @@ from headway.tasks.base import Task
 GROUP_SEEDS = 1000  # seeds reserved for each group, so that groups never share an episode
 
 
+Tests = dict[str, dict[int, Trajectory]]
+"""Test episodes by group, and by their number in it; those that broke are left out."""
+
+
 @dataclasses.dataclass(frozen=True)
 class PlanningCost:
     """What planning one step of one environment took, on average over some episodes."""
@@ -82,7 +86,7 @@ def evaluate_agent(
     key: PRNGKeyArray,
     progress: Progress,
     store: ProgressStore | None = None,
-) -> tuple[dict[str, list[Trajectory]], PlannerUse]:
+) -> tuple[Tests, PlannerUse]:
     """Run the test episodes of some groups, as many side by side as the batch holds.
 
     Args:
@@ -95,28 +99,27 @@ def evaluate_agent(
         store: Keeps what is done, for when the process is killed.
 
     Returns:
-        The trajectories of each group, in the order of their episodes without those that broke,
-        and what planning them took.
+        The episodes of each group in their order, and what planning them took.
 
     Raises:
         BadEnvironmentError: More episodes broke than allowed, or all of a group.
     """
     evaluation = config.evaluation
     episodes = [
-        (group, episode)
+        (group, number, episode)
         for group in groups
-        for episode in group_episodes(
-            arena.sim_params, group, evaluation.num_episodes, evaluation.seed
+        for number, episode in enumerate(
+            group_episodes(arena.sim_params, group, evaluation.num_episodes, evaluation.seed)
         )
     ]
-    found: dict[str, list[Trajectory]] = {group: [] for group in groups}
+    found: Tests = {group: {} for group in groups}
     size, use = arena.vector.num_envs, PlannerUse()
     allowed, forget = evaluation.max_bad_episodes, store.drop if store else lambda name: None
     bad = BadEpisodes("evaluation.max_bad_episodes", allowed, progress.message, forget)
     for chunk, start in enumerate(range(0, len(episodes), size)):
         batch = episodes[start : start + size]
         chunk_key = jax.random.fold_in(key, chunk)
-        side_by_side = [episode for _, episode in batch]
+        side_by_side = [episode for _, _, episode in batch]
         policy = functools.partial(AgentPolicy, agent, size, side_by_side, key=chunk_key)
         name = f"evaluate-{chunk}"
         if store is None:
@@ -125,15 +128,14 @@ def evaluate_agent(
             rollout = resumable_episodes(store, name, arena, side_by_side, policy, progress.advance)
         bad.leave_out(name, list(rollout.broken.values()))
         use += rollout.use
-        for number, trajectory in zip(rollout.numbers, rollout.trajectories, strict=True):
-            found[batch[number][0]].append(trajectory)
+        for place, trajectory in zip(rollout.numbers, rollout.trajectories, strict=True):
+            group, number, _ = batch[place]
+            found[group][number] = trajectory
     bad.want_some(min(map(len, found.values()), default=1))
     return found, use
 
 
-def episode_rows(
-    config: Config, iteration: int, trajectories: dict[str, list[Trajectory]]
-) -> list[EpisodeRow]:
+def episode_rows(config: Config, iteration: int, tests: Tests) -> list[EpisodeRow]:
     """Turn test episodes into rows of `evaluation.csv`."""
     return [
         EpisodeRow(
@@ -143,10 +145,10 @@ def episode_rows(
             iteration,
             group,
             trajectory.sim_params,
-            episode,
+            number,
             trajectory.returns,
             len(trajectory),
         )
-        for group, found in trajectories.items()
-        for episode, trajectory in enumerate(found)
+        for group, found in tests.items()
+        for number, trajectory in found.items()
     ]

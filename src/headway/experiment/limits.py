@@ -21,6 +21,11 @@ CGROUP = Path("/proc/self/cgroup")
 CGROUP_ROOT = Path("/sys/fs/cgroup")
 STATM = Path("/proc/self/statm")
 PAGE = 4096
+TRY = (
+    "choose smaller sizes, or give `headway train` --ignore-limits (ignore_limits=True) to try all"
+    " the same."
+)
+FREE = "choose smaller sizes or fewer candidates, or end what else takes memory."
 
 
 class MemoryNeed(NamedTuple):
@@ -163,32 +168,35 @@ def _planning(config: Config, task: Task) -> int:
     return FLOAT * (particles * widest + 4 * candidates)
 
 
-def check_memory(need: MemoryNeed) -> None:
+def check_memory(need: MemoryNeed, *, may_ignore: bool = False) -> None:
     """Refuse what does not fit, before the system's killer does.
+
+    Args:
+        need: What it takes.
+        may_ignore: Whether this is training, which can be told to ignore the limits.
 
     Raises:
         LimitError: The estimate is above what is free on the machine or on its accelerator.
     """
-    device = jax.local_devices()[0]
+    device, advice = jax.local_devices()[0], TRY if may_ignore else FREE
     on_host = need
     if device.platform != "cpu":
         on_host = need._replace(model=0, fitting=0, planning=0)
         stats = device.memory_stats() or {}
         limit, used = stats.get("bytes_limit"), stats.get("bytes_in_use", 0)
         on_device = need._replace(process=0, workers=0)
-        _compare(on_device, limit and limit - used, f"on {device.device_kind}")
+        _compare(on_device, limit and limit - used, f"on {device.device_kind}; {advice}")
     free = free_memory()
-    _compare(on_host, free if free is None else free + resident(), "on this machine")
+    _compare(on_host, free if free is None else free + resident(), f"on this machine; {advice}")
 
 
-def _compare(need: MemoryNeed, free: int | None, where: str) -> None:
+def _compare(need: MemoryNeed, free: int | None, where_and_advice: str) -> None:
     if free is None or need.total <= free:
         return
     parts = ", ".join(f"{name} {gib(value)}" for name, value in need._asdict().items() if value)
     raise LimitError(
         f"this run needs about {gib(need.total)} GiB of memory ({parts}), {gib(free)} GiB is free"
-        f" {where}; choose smaller sizes, or pass --ignore-limits (ignore_limits=True) to try all"
-        " the same."
+        f" {where_and_advice}"
     )
 
 

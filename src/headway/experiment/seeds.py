@@ -131,7 +131,7 @@ def _side_by_side(
 ) -> dict[int, HeadwayError]:
     """Train every run in a thread of its own; return why some failed."""
     if not options["ignore_limits"]:
-        check_memory(need_of(jobs[0].config).times(len(jobs)))
+        check_memory(need_of(jobs[0].config).times(len(jobs)), may_ignore=True)
     with progress as shown, contextlib.ExitStack() as held:
         for job in jobs:
             held.enter_context(job.run.locked())

@@ -15,7 +15,7 @@ from headway.data import ReplayBuffer, Trajectory
 from headway.errors import BadEnvironmentError, DivergenceError
 from headway.experiment.bad_episodes import BadEpisodes
 from headway.experiment.divergence import SLOWER, diverged, divergence, first_non_finite
-from headway.experiment.evaluation import episode_rows, evaluate_agent
+from headway.experiment.evaluation import Tests, episode_rows, evaluate_agent
 from headway.experiment.learners import Fit, Learned, Learner, make_learner
 from headway.experiment.limits import check_memory
 from headway.experiment.loading import initial, load_learned, need_of
@@ -157,16 +157,16 @@ class Trainer:
         keys = Keys.of(self.config.seed, iteration)
         learning = self.learn(iteration, keys) if self.learner.learns else {}
         with self.store.timing("evaluate"):
-            tested, test_use = self.evaluate(iteration, keys.evaluate)
+            tests, test_use = self.evaluate(iteration, keys.evaluate)
         metrics = {
             "iteration": iteration,
             "timesteps": self.buffer.num_transitions,
             **learning,
-            "evaluation": {group: _summary(found) for group, found in tested.items()},
+            "evaluation": {group: _summary([*found.values()]) for group, found in tests.items()},
             "test_planner_failures": test_use.failures,
             "seconds": self.store.seconds,
         }
-        self.save(iteration, tested, metrics, keys.diagnose)
+        self.save(iteration, tests, metrics, keys.diagnose)
         self.progress.iteration_done(metrics)
 
     def learn(self, iteration: int, keys: Keys) -> dict[str, Any]:
@@ -268,9 +268,7 @@ class Trainer:
         where = first_non_finite(trajectories, self.learner.head_losses(self.learned, trajectories))
         raise diverged(epoch, rollbacks, problem, where)
 
-    def evaluate(
-        self, iteration: int, key: PRNGKeyArray
-    ) -> tuple[dict[str, list[Trajectory]], PlannerUse]:
+    def evaluate(self, iteration: int, key: PRNGKeyArray) -> tuple[Tests, PlannerUse]:
         """Test on the unseen groups, and on the training physics when the settings say so."""
         groups = self.groups(iteration)
         if not groups:
@@ -289,14 +287,15 @@ class Trainer:
     def save(
         self,
         iteration: int,
-        tested: dict[str, list[Trajectory]],
+        tests: Tests,
         metrics: dict[str, Any],
         key: PRNGKeyArray,
     ) -> None:
         """Write everything of a finished iteration; the metrics come last."""
         run, config, learner = self.run, self.config, self.learner
         arrays.save_tree(run.checkpoint(iteration), self.learned)
-        run.append_evaluation(episode_rows(config, iteration, tested))
+        run.append_evaluation(episode_rows(config, iteration, tests))
+        tested = {group: list(found.values()) for group, found in tests.items()}
         run.save_tests(iteration, tested)
         shares = learner.head_shares(self.learned, self.buffer.trajectories)
         run.append_assignments([{"iteration": iteration, **row} for row in shares])
@@ -339,8 +338,9 @@ def train_run(
     check_block(config)
     run = RunDir(run_dir)
     if not ignore_limits:
-        check_memory(need_of(config))
-    with progress or Progress() as shown, run.locked(), stop_requests() as stop:
+        check_memory(need_of(config), may_ignore=True)
+    # A display begins once it is certain that the run does.
+    with run.locked(), progress or Progress() as shown, stop_requests() as stop:
         if resume_from_last_good:
             shown.message(went_back(run.go_back()))
         trainer = Trainer.open(config, run, shown, stop)

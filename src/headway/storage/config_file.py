@@ -1,4 +1,4 @@
-"""The file `config.json` of a run: schema, settings, versions, device."""
+"""The file `config.json` of a run: schema, settings, versions, device, commit."""
 
 import importlib.metadata
 import platform
@@ -10,7 +10,7 @@ import jax
 from headway import settings
 from headway.config import Config
 from headway.errors import RunError
-from headway.storage import files
+from headway.storage import checkout, files
 
 SCHEMA = 2  # of a run directory
 UNCHECKED = 1  # the schema before there were checksums
@@ -29,7 +29,8 @@ def content(config: Config) -> bytes:
         },
         "device": str(jax.devices()[0].device_kind),
     }
-    return files.seal(values)
+    commit = checkout.commit()
+    return files.seal(values if commit is None else {**values, "commit": commit})
 
 
 def read(path: Path) -> dict[str, Any]:

@@ -35,7 +35,9 @@ def write_bytes(path: Path, content: bytes) -> None:
 
     Raises:
         LimitError: The disk is full, or would be nearly full.
+        RunError: Something else than a regular file has this name.
     """
+    check_target(path)
     make_dir(path.parent)
     if free_space(path) < len(content) + SPARE_BYTES:
         raise _full(path, len(content))
@@ -56,6 +58,19 @@ def write_bytes(path: Path, content: bytes) -> None:
         with contextlib.suppress(OSError):  # on such a disk even that may fail
             temporary.unlink(missing_ok=True)
         raise _full(path, len(content)) from None
+
+
+def check_target(path: Path) -> None:
+    """Refuse to write where no file can be, or where a device or a directory would be replaced.
+
+    Raises:
+        RunError: The path ends with no name, or with that of something else than a regular file.
+    """
+    if not path.name or (path.exists() and not path.is_file()):
+        raise RunError(
+            f"{path} is no regular file, allowed: the name of a new file or of one to replace;"
+            " choose another name."
+        )
 
 
 def make_dir(path: Path) -> None:

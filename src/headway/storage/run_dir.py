@@ -132,10 +132,10 @@ class RunDir:
         if manifest is not None:
             with self._iterations.advice():
                 manifest.check(self.path)
-        self.evaluation()
-        self.assignments()
-        self.prediction_errors()
-        finished = len(self.metrics())
+        self._evaluation(manifest)
+        self._table("assignments.csv", ASSIGNMENT_COLUMNS, typed_row, manifest)
+        self._table("prediction_error.csv", PREDICTION_COLUMNS, typed_row, manifest)
+        finished = len(self._metrics(manifest))
         beyond = [path for path in self._iterations.files("checkpoints") if number(path) > finished]
         if beyond:
             place = "manifests" if self._schema == SCHEMA else "metrics.jsonl"
@@ -150,24 +150,20 @@ class RunDir:
         Raises:
             RunError: The file is damaged.
         """
-        path = self.path / "metrics.jsonl"
-        rows = check_metrics(path, records.parse_json_lines(path, self._text("metrics.jsonl")))
-        manifest = self.manifest()
-        if manifest is not None and manifest.iteration + 1 != len(rows):
-            raise files.damaged(path, f"the manifest ends with iteration {manifest.iteration}")
-        return rows
+        return self._metrics(self.manifest())
 
     def evaluation(self) -> list[EpisodeRow]:
         """Every test episode of the finished iterations."""
-        return self._table("evaluation.csv", EVALUATION_COLUMNS, EpisodeRow.from_csv)
+        return self._evaluation(self.manifest())
 
     def assignments(self) -> list[dict[str, Any]]:
         """Share of segments that each head owns, per iteration, member and physics."""
-        return self._table("assignments.csv", ASSIGNMENT_COLUMNS, typed_row)
+        return self._table("assignments.csv", ASSIGNMENT_COLUMNS, typed_row, self.manifest())
 
     def prediction_errors(self) -> list[dict[str, Any]]:
         """Error by imagined step, per iteration and group."""
-        return self._table("prediction_error.csv", PREDICTION_COLUMNS, typed_row)
+        manifest = self.manifest()
+        return self._table("prediction_error.csv", PREDICTION_COLUMNS, typed_row, manifest)
 
     def append_evaluation(self, rows: Iterable[EpisodeRow]) -> None:
         """Add test episodes behind those of the finished iterations."""
@@ -185,7 +181,8 @@ class RunDir:
         """Add metrics behind those of the finished iterations."""
         path = inside(self.path, "metrics.jsonl")
         lines = records.json_lines(path, rows)
-        files.write_bytes(path, self._text("metrics.jsonl") + lines.encode())
+        before = self._text("metrics.jsonl", self.manifest())
+        files.write_bytes(path, before + lines.encode())
 
     def checkpoint(self, iteration: int) -> Path:
         """The file with the networks, optimiser and statistics after an iteration."""
@@ -199,6 +196,11 @@ class RunDir:
         """
         manifest = self.manifest()
         if manifest is not None:
+            if not inside(self.path, "checkpoints").exists():
+                raise RunError(
+                    f"{self.path} is a copy without checkpoints, allowed: a run with them; name the"
+                    " run itself."
+                )
             with self._iterations.advice():
                 manifest.check(self.path, ["config.json", checkpoint_name(iteration)])
         return self.checkpoint(iteration)
@@ -237,7 +239,7 @@ class RunDir:
         with self._iterations.advice():
             manifest.check(self.path, names)
         episodes = records.load_trajectories(inside(self.path, name))
-        rows = [row for row in self.evaluation() if row.iteration == manifest.iteration]
+        rows = [row for row in self._evaluation(manifest) if row.iteration == manifest.iteration]
         for row, trajectory in zip(rows, episodes, strict=True):
             found.setdefault(row.group, []).append(trajectory)
         return found
@@ -305,17 +307,35 @@ class RunDir:
             self._iterations.finish_all(finished, content)
         files.write_bytes(self.path / "config.json", content)
 
-    def _text(self, name: str) -> bytes:
-        """The part of a table that belongs to finished iterations; all of it in schema 1."""
-        manifest = self.manifest()
+    def _metrics(self, manifest: Manifest | None) -> list[dict[str, Any]]:
+        path = self.path / "metrics.jsonl"
+        lines = records.parse_json_lines(path, self._text("metrics.jsonl", manifest))
+        rows = check_metrics(path, lines)
+        if manifest is not None and manifest.iteration + 1 != len(rows):
+            raise files.damaged(path, f"the manifest ends with iteration {manifest.iteration}")
+        return rows
+
+    def _evaluation(self, manifest: Manifest | None) -> list[EpisodeRow]:
+        return self._table("evaluation.csv", EVALUATION_COLUMNS, EpisodeRow.from_csv, manifest)
+
+    def _text(self, name: str, manifest: Manifest | None) -> bytes:
+        """The part of a table that belongs to finished iterations; all of it in schema 1.
+
+        Args:
+            name: The table.
+            manifest: What the newest finished iteration stands on. Whoever looks at it twice
+                reads it once: while a run is trained, another one may stand there a moment later.
+        """
         if manifest is not None:
             with self._iterations.advice():
                 return manifest.read_text(self.path, name)
         path = inside(self.path, name)
         return files.read_bytes(path) if self._schema == UNCHECKED and path.exists() else b""
 
-    def _table(self, name: str, columns: tuple[str, ...], parse: Any) -> list[Any]:
-        rows = records.parse_csv(self.path / name, self._text(name), columns)
+    def _table(
+        self, name: str, columns: tuple[str, ...], parse: Any, manifest: Manifest | None
+    ) -> list[Any]:
+        rows = records.parse_csv(self.path / name, self._text(name, manifest), columns)
         if self._schema == UNCHECKED:
             finished = self.finished_iterations
             rows = (row for row in rows if int(row["iteration"]) < finished)
@@ -324,7 +344,7 @@ class RunDir:
     def _append(
         self, name: str, columns: tuple[str, ...], rows: Iterable[Mapping[str, Any]]
     ) -> None:
-        before = self._text(name)
+        before = self._text(name, self.manifest())
         lines = records.csv_lines(columns, rows, header=not before)
         files.write_bytes(inside(self.path, name), before + lines.encode())
 

@@ -9,7 +9,7 @@ from typing import Self, TextIO
 from headway.errors import HeadwayError
 from headway.experiment.progress import duration
 from headway.sweeps.jobs import Job
-from headway.sweeps.status import Status
+from headway.sweeps.status import Status, reason
 
 
 class Board:
@@ -41,6 +41,8 @@ class Board:
         before = self.statuses[job.path]
         if not before.over:
             self.statuses[job.path] = status
+            for text in status.messages[len(before.messages) :]:
+                self.message(f"{describe(job)}: {text}")
             self.show(job, before, status)
 
     def show(self, job: Job, before: Status, status: Status) -> None:
@@ -87,8 +89,8 @@ def first_status(job: Job) -> Status:
     """How a job stands by its directory."""
     try:
         finished = job.finished_iterations
-    except HeadwayError as error:
-        return Status("failed", note=str(error))
+    except (HeadwayError, OSError) as error:
+        return Status("failed", note=reason(error))
     return Status("done" if finished >= job.num_iterations else "waiting", finished)
 
 

@@ -46,15 +46,29 @@ class Plan:
         """Time for some jobs, one after another; for all of them by default."""
         return sum(job.flop for job in (self.jobs if jobs is None else jobs)) / self.flop_per_second
 
+    @property
+    def note(self) -> str:
+        """What the estimate leaves out among the missing runs; empty where that is nothing."""
+        missing = [one.job.config for one in self.jobs if one.state == "waiting"]
+        count = sum(config.model.kind == "simulator" for config in missing)
+        if not count:
+            return ""
+        return (
+            f"Not counted: the time of {count} missing runs that plan on the true dynamics; on"
+            " robots they take the longest of all."
+        )
+
 
 def make_plan(jobs: Sequence[Job]) -> Plan:
     """List what is missing and estimate what it takes; nothing is run.
 
     Args:
-        jobs: Every run of a comparison. Those finished already give the speed.
+        jobs: Every run of a comparison. Those finished already give the speed, unless they
+            learned nothing and so tell nothing of it.
     """
     planned = [_planned(job) for job in jobs]
-    speeds = [_measured_speed(one.job) for one in planned if one.state == "done"]
+    done = [one.job for one in planned if one.state == "done" and run_flop(one.job.config)]
+    speeds = [_measured_speed(job) for job in done]
     if speeds:
         return Plan(planned, float(np.median(speeds)), f"{len(speeds)} finished runs")
     return Plan(planned, _matrix_rate() / PER_PRODUCT, "matrix products timed just now")

@@ -9,13 +9,14 @@ import hashlib
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from headway import settings
 from headway.config import Config
 from headway.errors import ConfigError, RunError
 from headway.experiment.methods import make_config
 from headway.storage.run_dir import RunDir
+from headway.sweeps import results_folder
 from headway.sweeps.experiments import Arm, Experiment, Settings
 from headway.tasks.catalog import env_spec
 
@@ -96,9 +97,31 @@ class Comparison:
                 raise ConfigError(f"{name} is {values}, allowed: one or more, each once.")
 
     @property
-    def folder(self) -> Path:
-        """Where the figure, the raw numbers and the table go."""
+    def usual_folder(self) -> Path:
+        """Where the figure, the raw numbers and the table go, unless others are there."""
         return self.out / f"{self.experiment.name}-{self.preset}"
+
+    @property
+    def folder(self) -> Path:
+        """Where they go; it depends on what is there already (`results_folder`)."""
+        return results_folder.choose(self.usual_folder, self.facts)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """All that is compared, as plain values."""
+        return {
+            "experiment": self.experiment.name,
+            "measure": self.experiment.measure,
+            "reference": self.experiment.reference,
+            "preset": self.preset,
+            "settings": dict(self.settings),
+            "envs": self.envs,
+            "seeds": self.seeds,
+            "arms": [
+                {"label": arm.label, "method": arm.method, "settings": dict(arm.settings)}
+                for arm in self.experiment.arms
+            ],
+        }
 
     @property
     def cells(self) -> dict[Cell, Job]:

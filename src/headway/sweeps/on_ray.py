@@ -26,11 +26,12 @@ from headway.storage.interrupts import stop_requests
 from headway.sweeps.board import Board, first_status
 from headway.sweeps.jobs import Job
 from headway.sweeps.running import PATIENCE, Workers, make_run
-from headway.sweeps.status import Status
+from headway.sweeps.status import Status, reason
 
 MAX_LOSSES = 5  # of one run's workers, without an iteration finished between them
 POLL = 0.5  # seconds
 FAREWELL = 15.0  # seconds that interrupted runs get to save
+PRIVATE = "headway-private"  # a resource of a Ray that a sweep has started for itself
 GPU_MEMORY = 0.9  # share that runs on one GPU take together
 
 
@@ -58,18 +59,39 @@ def _connected(address: str | None) -> Iterator[None]:
         yield
         return
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    alone: dict[str, Any] = {} if address else {"include_dashboard": False}
+    alone: dict[str, Any] = {"include_dashboard": False, "resources": {PRIVATE: 1}}
+    options = {} if address else alone
     try:
-        ray.init(address or "local", logging_level=logging.ERROR, log_to_driver=False, **alone)
+        ray.init(address or "local", logging_level=logging.ERROR, log_to_driver=False, **options)
     except (ConnectionError, ValueError) as error:
         raise ConfigError(
-            f"there is no Ray cluster at address {address!r} ({error}); start one with `ray start"
-            " --head`, or leave --address out."
+            f"there is no Ray cluster at address {address!r} ({reason(error)}); start one with `ray"
+            " start --head`, or leave --address out."
+        ) from None
+    except RuntimeError as error:
+        raise ConfigError(
+            f"Ray at {address or 'this machine'} cannot be used ({reason(error)}); a cluster needs"
+            " the same versions of Ray and Python everywhere, and --one-by-one needs no Ray."
         ) from None
     try:
+        if address:
+            _refuse_private(address)
         yield
     finally:
         ray.shutdown()
+
+
+def _refuse_private(address: str) -> None:
+    """Keep out of what another sweep has started for itself, and ends with itself.
+
+    Raises:
+        ConfigError: It is the Ray of another sweep.
+    """
+    if any(PRIVATE in node["Resources"] for node in ray.nodes() if node["Alive"]):
+        raise ConfigError(
+            f"the Ray at address {address!r} belongs to another sweep on that machine, and ends"
+            " with it; leave --address out, or start a cluster with `ray start --head`."
+        )
 
 
 def _task_options(workers: Workers) -> dict[str, Any]:
@@ -201,7 +223,7 @@ class _Dispatcher:
             return Status(**ended)
         except RayTaskError as error:
             cause = error.cause if isinstance(error.cause, Exception) else error
-            return Status("failed", reached, note=f"{type(cause).__name__}: {cause}")
+            return Status("failed", reached, note=reason(cause))
         except (TaskUnschedulableError, RuntimeEnvSetupError) as error:
             return Status("failed", reached, note=str(error))
         except RayError as error:

@@ -10,12 +10,12 @@ from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from headway.errors import BusyError, ConfigError, HeadwayError, SeedsError
+from headway.errors import BusyError, ConfigError, SeedsError
 from headway.experiment.seeds import train_seeds
 from headway.experiment.training import train_run
 from headway.sweeps.board import Board, first_status
 from headway.sweeps.jobs import Job
-from headway.sweeps.status import Status, StatusProgress, Tell
+from headway.sweeps.status import Status, StatusProgress, Tell, reason
 
 PATIENCE = 5.0  # seconds before a run is tried again that another process holds
 INSTALL_RAY = "`pip install '.[ray]'` in the clone of Headway"
@@ -43,11 +43,22 @@ class Workers:
                 f"cpus_per_run is {self.cpus_per_run} and gpus_per_run {self.gpus_per_run},"
                 " allowed: more than 0 cores, and 0 or more GPUs."
             )
+        if gpus > 1 and gpus != int(gpus):
+            raise ConfigError(
+                f"gpus_per_run is {gpus:g}, allowed: a share of one GPU, or whole ones."
+            )
+        of_ray = {
+            "address": self.address or None,
+            "cpus_per_run": None if self.cpus_per_run == 1 else self.cpus_per_run,
+            "gpus_per_run": self.gpus_per_run,
+        }
         for name in ("one_by_one", "seeds_together"):
-            if getattr(self, name) and self.address:
-                raise ConfigError(
-                    f"{name} takes no Ray cluster, got address {self.address!r}; leave one out."
-                )
+            for other, value in of_ray.items():
+                if getattr(self, name) and value is not None:
+                    raise ConfigError(
+                        f"{name} makes runs without Ray, got {other} {value!r}, which only Ray"
+                        " heeds; leave one out."
+                    )
 
 
 def run_jobs(jobs: Sequence[Job], workers: Workers, board: Board) -> None:
@@ -110,7 +121,7 @@ def seeds_of_each(jobs: Sequence[Job]) -> list[list[Job]]:
 
 def make_together(jobs: Sequence[Job], board: Board) -> None:
     """Train runs that differ in nothing but the seed, each to its end or its own failure."""
-    failures: Mapping[int, HeadwayError] = {}
+    failures: Mapping[int, Exception] = {}
     if len(jobs) > 1:
         told = {
             job.config.seed: StatusProgress(
@@ -123,14 +134,14 @@ def make_together(jobs: Sequence[Job], board: Board) -> None:
             train_seeds(jobs[0].config, places, of_seed=told)
         except SeedsError as error:
             failures = error.failures
-        except HeadwayError as error:  # none has begun
-            board.message(f"each seed by itself, because {error}")
+        except Exception as error:  # alone, what is at fault fails alone
+            board.message(f"each seed by itself, because {reason(error)}")
     for job in jobs:  # what is finished by now is not made again
-        reason = failures.get(job.config.seed)
-        if reason is None:
+        failure = failures.get(job.config.seed)
+        if failure is None:
             ended = make_run(job, functools.partial(board.tell, job))
         else:
-            ended = Status("failed", first_status(job).iteration, note=str(reason))
+            ended = _stopped(failure, first_status(job).iteration)
         returns = ended.returns or board.statuses[job.path].returns
         board.tell(job, dataclasses.replace(ended, returns=returns))
 
@@ -145,7 +156,7 @@ def make_run(job: Job, tell: Tell) -> Status:
     Returns:
         How it stands in the end: `done`, `failed`, or `busy` where another process trains it.
     """
-    reached = Status()
+    reached = first_status(job)
 
     def note(status: Status) -> None:
         nonlocal reached
@@ -155,8 +166,13 @@ def make_run(job: Job, tell: Tell) -> Status:
     try:
         if not job.finished:
             train_run(job.config, job.path, StatusProgress(note, job.finished_iterations))
-        return Status("done", job.num_iterations, returns=reached.returns)
-    except BusyError as error:
-        return Status("busy", reached.iteration, note=str(error))
-    except HeadwayError as error:
-        return Status("failed", reached.iteration, note=str(error))
+        done = Status("done", job.num_iterations, returns=reached.returns)
+    except Exception as error:  # on Ray, too, the others go on whatever it is
+        done = _stopped(error, reached.iteration)
+    return dataclasses.replace(done, messages=reached.messages)
+
+
+def _stopped(error: Exception, iteration: int) -> Status:
+    """How a run stands that an error ended: another process may be at it, or it has failed."""
+    state = "busy" if isinstance(error, BusyError) else "failed"
+    return Status(state, iteration, note=reason(error))

@@ -3,13 +3,15 @@
 import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
+from headway.errors import HeadwayError
 from headway.experiment.progress import Clock, Estimate, Phase, Progress, summarise_returns
 
 State = Literal["waiting", "running", "busy", "lost", "done", "failed"]
 
 EVERY = 0.5  # seconds between two reports of one run
+MAX_REASON = 500  # characters of an error that Headway has not worded
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,6 +30,8 @@ class Status:
     """Seconds left, None while not known."""
     note: str = ""
     """Why it failed."""
+    messages: tuple[str, ...] = ()
+    """What it said that should stay readable, since it was begun or resumed."""
 
     @property
     def over(self) -> bool:
@@ -36,6 +40,14 @@ class Status:
 
 
 Tell = Callable[[Status], None]
+
+
+def reason(error: BaseException) -> str:
+    """Word in one line why a run failed."""
+    text = " ".join(str(error).split())
+    if isinstance(error, HeadwayError):
+        return text
+    return f"{type(error).__name__}: {text[:MAX_REASON]}{'...' * (len(text) > MAX_REASON)}"
 
 
 class StatusProgress(Progress):
@@ -53,7 +65,11 @@ class StatusProgress(Progress):
         self._status = Status("running", iteration, "preparing")
         self._name, self._total = "", 1
         self._told = clock()
-        tell(self._status)
+
+    def __enter__(self) -> Self:
+        """Say that the run has begun."""
+        self._tell(self._status)
+        return self
 
     def schedule(self, phases: Sequence[Phase]) -> None:
         """Take over the announced phases."""
@@ -77,10 +93,14 @@ class StatusProgress(Progress):
         returns = "  ".join(summarise_returns(metrics))
         self._report(iteration=metrics["iteration"] + 1, returns=returns)
 
+    def message(self, text: str) -> None:
+        """Report it at once, and with every later report; reports may be lost on their way."""
+        self._report(messages=(*self._status.messages, text))
+
     def _report(self, **changes: Any) -> None:
         self._told = self._clock()
         done = min(self._estimate.done / self._total, 1.0)
-        phase = f"{self._name} {done:.0%}"
+        phase = f"{self._name} {done:.0%}" if self._name else self._status.phase
         self._status = dataclasses.replace(
             self._status, phase=phase, left=self._estimate.left, **changes
         )
