@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import json
 import re
 
 import fakes
@@ -11,10 +10,6 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from headway import compare
-from headway.cli import main
-from headway.cli.comparisons import read_seeds, read_settings
-from headway.cli.usage import UsageError
 from headway.compare import reproduce
 from headway.report.comparison.figure import _curves, _dots, arm_styles, has_curves
 from headway.report.comparison.runs import Found, Point, _points, find
@@ -22,19 +17,11 @@ from headway.report.comparison.verdicts import verdicts
 from headway.report.comparison.writing import spread, table_rows, write_table
 from headway.storage.run_dir import RunDir
 from headway.sweeps import running
-from headway.sweeps.experiments import EXPERIMENTS, Arm, Experiment, experiment, sweep_experiment
+from headway.sweeps.experiments import Arm, Experiment, experiment, sweep_experiment
 from headway.sweeps.jobs import Cell, Comparison
 from headway.sweeps.running import Workers
 
 HERE = Workers(one_by_one=True)
-WORDS = ("--envs", "pendulum", "--preset", "smoke", "--one-by-one", "--quiet")
-
-
-@pytest.fixture
-def training(monkeypatch):
-    fake = fakes.FakeTraining()
-    monkeypatch.setattr(running, "train_run", fake)
-    return fake
 
 
 def comparison(out, name="fig13", seeds=(0, 1, 2), envs=("pendulum",), **settings):
@@ -214,12 +201,6 @@ def test_another_figure_reuses_the_runs(training, tmp_path):
     assert len(done.found.final_points) == 5
 
 
-@pytest.fixture
-def without_figures(monkeypatch):
-    """Figures take long to draw."""
-    monkeypatch.setattr(compare, "draw_comparison", lambda found: [])
-
-
 @pytest.mark.usefixtures("training", "without_figures")
 def test_a_comparison_replaces_what_it_contains_and_nothing_else(tmp_path):
     board = fakes.Remembering()
@@ -244,16 +225,6 @@ def test_a_comparison_replaces_what_it_contains_and_nothing_else(tmp_path):
     assert (usual / "fig13.csv").read_bytes() == both
     (usual / "comparison.json").write_text("{")
     assert make(seeds=(0, 1), envs=("pendulum", "hopper")) != usual
-
-
-@pytest.mark.usefixtures("training", "without_figures")
-def test_sweeps_of_the_same_name_do_not_replace_each_other(tmp_path, capsys):
-    words = ("sweep", *WORDS, "--seeds", "0", "--out", str(tmp_path), "--json")
-    files = [
-        json.loads(run(capsys, *words, "--methods", *methods)[1])["files"]
-        for methods in (["pets"], ["pets", "tmcl"], ["mcl"])
-    ]
-    assert files[0] == files[1] != files[2]
 
 
 def test_nothing_finished_makes_no_figure_but_a_table(tmp_path):
@@ -311,138 +282,3 @@ def test_arms_of_one_method_keep_their_order_and_titles_are_for_readers(training
     drawn = (tmp_path / "fig12-smoke/fig12.svg").read_text()
     assert "<!-- With and without context learning, pendulum -->" in drawn
     assert "fig12" not in drawn
-
-
-def run(capsys, *words):
-    """Exit code, stdout and stderr of one command."""
-    code = main(words)
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err
-
-
-def test_reproduce_on_the_command_line(training, tmp_path, capsys):
-    words = ("reproduce", "fig13", *WORDS, "--seeds", "0:2", "--out", str(tmp_path))
-    code, out, _ = run(capsys, *words)
-    assert code == 0
-    assert re.search(r"T-MCL +2 +41.5 ± 0.7 +– +141.5 ± 0.7", out)
-    assert "headway reproduce fig13 --envs pendulum --preset smoke" in out
-    code, out, _ = run(capsys, *words, "--json")
-    facts = json.loads(out)
-    assert (code, facts["runs"], facts["failures"], len(facts["files"])) == (0, 4, {}, 4)
-    assert {(p["arm"], p["seed"], p["value"]) for p in facts["returns"]} == {
-        ("MCL", 0, 31.0), ("MCL", 1, 32.0), ("T-MCL", 0, 41.0), ("T-MCL", 1, 42.0)
-    }  # fmt: skip
-    assert len(training.calls) == 4
-
-
-def test_a_failed_run_is_told_on_stderr_with_exit_code_1(training, tmp_path, capsys):
-    training.answers = {0: [fakes.DIVERGED]}
-    words = ("reproduce", "fig13", *WORDS, "--seeds", "0", "--out", str(tmp_path))
-    code, out, err = run(capsys, *words)
-    assert code == 1
-    assert "seed0: no finite number" in err
-    assert "T-MCL" in out
-
-
-def test_dry_run_lists_and_runs_nothing(training, tmp_path, capsys):
-    words = ("reproduce", "fig15", *WORDS, "--seeds", "0", "--out", str(tmp_path), "--dry-run")
-    code, out, _ = run(capsys, *words)
-    assert code == 0
-    assert "5 of 5 runs are missing" in out
-    code, out, _ = run(capsys, *words, "--json")
-    facts = json.loads(out)
-    assert [entry["state"] for entry in facts["runs"]] == ["waiting"] * 5
-    assert facts["runs"][0]["arms"] == ["M = 1"]
-    assert facts["note"] == ""
-    words = ("reproduce", "comparison", *words[2:])
-    assert "missing runs that plan on the true dynamics" in run(capsys, *words)[1]
-    assert training.calls == []
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_sweep_on_the_command_line(training, tmp_path, capsys):
-    code, out, _ = run(
-        capsys, "sweep", *WORDS, "--seeds", "5", "--out", str(tmp_path), "--name", "mine",
-        "--methods", "pets", "tmcl", "--settings", "planner.horizon=3,5", "fitting.epochs=1",
-        "--json",
-    )  # fmt: skip
-    assert code == 0
-    assert [point["arm"] for point in json.loads(out)["returns"]] == [
-        "PETS, planner.horizon 3", "PETS, planner.horizon 5",
-        "T-MCL, planner.horizon 3", "T-MCL, planner.horizon 5",
-    ]  # fmt: skip
-    assert "smoke`, fitting.epochs 1, seeds 5" in (tmp_path / "mine-smoke/mine.md").read_text()
-    runs = list(tmp_path.glob("runs/pendulum/*/seed5"))
-    settings = [RunDir(path).config() for path in runs]
-    assert sorted(config.planner.horizon for config in settings) == [3, 3, 5, 5]
-    assert {config.fitting.epochs for config in settings} == {1}
-
-
-@pytest.mark.parametrize(
-    ("words", "seeds"), [(["0:3"], (0, 1, 2)), (["4"], (4,)), (["1", "7:9"], (1, 7, 8))]
-)
-def test_seeds(words, seeds):
-    assert read_seeds(words) == seeds
-
-
-@pytest.mark.parametrize("word", ["x", "3:3", "3:1", "-1", "0:99999999", "1:2:3"])
-def test_bad_seeds(word):
-    with pytest.raises(UsageError, match=r"--seeds is .*allowed"):
-        read_seeds([word])
-
-
-def test_settings_are_json_or_text():
-    words = ["model.hidden_sizes=[8,8],[9]", "planner.head-selection=average", "a=1,2.5"]
-    words += ['env_options={"x":true,"y":false},{"x":false}', "b=[[1,2],[3]]", "c=1, x,2.y,1e5z"]
-    assert read_settings(words) == {
-        "model.hidden_sizes": [[8, 8], [9]],
-        "planner.head_selection": ["average"],
-        "a": [1, 2.5],
-        "env_options": [{"x": True, "y": False}, {"x": False}],
-        "b": [[[1, 2], [3]]],
-        "c": [1, "x", "2.y", "1e5z"],
-    }
-
-
-BAD_SETTINGS = ["a", "a=", "=1", "a=1,", "a=x,,y", "a=,", "a=[8,8", 'a={"x":true', "a=[1]2"]
-
-
-@pytest.mark.parametrize("words", [*([word] for word in BAD_SETTINGS), ["a=1", "a=2"]])
-def test_bad_settings(words):
-    with pytest.raises(UsageError, match=r"--settings is"):
-        read_settings(words)
-
-
-def test_reproduce_takes_one_value_of_a_setting(tmp_path, capsys):
-    words = ("reproduce", "fig13", *WORDS, "--settings", "planner.horizon=1,2")
-    code, _, err = run(capsys, *words)
-    assert code == 2
-    assert "planner.horizon has 2 values, allowed: one" in err
-
-
-def test_an_unknown_experiment_is_told_with_the_closest(capsys):
-    code, _, err = run(capsys, "reproduce", "fgi13", *WORDS)
-    assert code == 1
-    assert "Did you mean 'fig13'?" in err
-
-
-def test_a_real_run_through_the_command_line(tmp_path, capsys):
-    settings = [f"{name}={json.dumps(value)}" for name, value in fakes.TINY.items()]
-    words = ("reproduce", "fig10", *WORDS, "--seeds", "0", "--out", str(tmp_path))
-    code, out, _ = run(capsys, *words, "--settings", *settings, "--json")
-    assert code == 0
-    returns = {point["arm"]: point["value"] for point in json.loads(out)["returns"]}
-    assert set(returns) == {"PETS", "Multi-Headed PETS"}
-    assert all(-200 < value < 0 for value in returns.values())
-    code, again, _ = run(capsys, *words, "--settings", *settings, "--json")
-    assert again == out
-
-
-def test_experiments_are_listed(capsys):
-    code, out, _ = run(capsys, "list", "experiments")
-    assert code == 0
-    assert all(name in out for name in EXPERIMENTS)
-    code, out, _ = run(capsys, "list", "experiments", "--json")
-    entries = json.loads(out)["experiments"]
-    assert [entry["name"] for entry in entries] == list(EXPERIMENTS)
-    assert entries[-1]["arms"][2]["settings"] == {"fitting.oracle": "independent"}
