@@ -112,6 +112,13 @@ def variant(path, **changes):
     return RunDir(path)
 
 
+def test_what_all_kept_runs_share_names_no_arm(keep, tmp_path):
+    length = {"collection.episode_length": 150}
+    run = variant(tmp_path / "shorter", **length)
+    assert keep(run, tmp_path / "a", length).parent.name == "tmcl"
+    assert keep(run, tmp_path / "b").parent.name.startswith("tmcl-")
+
+
 def test_what_is_kept_of_a_run_can_be_reported_but_not_used(keep, tmp_path, capsys):
     kept = keep(RunDir(FINISHED), tmp_path / "kept")
     assert kept == tmp_path / "kept" / "tmcl" / "seed-0"
