@@ -27,7 +27,7 @@ from headway.report.style import group_label
 def results(comparison: Comparison) -> Section:
     """Tables of the final results."""
     lead = (
-        "After the last iteration. Scores are 0 for random actions and 1 for the same planner on"
+        "After the last iteration. Scores are 0 for random actions and 1 for a planner on"
         " the true dynamics; they are interquartile means over seeds with 95 % bootstrap intervals."
         " Returns are means ± standard deviations over seeds. Every physics of a group counts once."
     )
