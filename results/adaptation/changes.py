@@ -21,7 +21,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Float
-from measure import LAST_LAYER, name_of
+from measure import ARMS as MEASURED
+from measure import name_of
 
 from headway.config import Config
 from headway.data import Trajectory
@@ -35,13 +36,16 @@ COLUMNS = (
     "run", "env", "method", "seed", "arm", "settings", "step", "episode", "before", "after", "over",
     "return_after", "reward_before", "recovery_steps",
 )  # fmt: skip
-ARMS: dict[str, dict[str, Any]] = {
-    "none": {},
-    "last-layer": LAST_LAYER,
-    "last-layer, change detection": LAST_LAYER | {"planner.change_threshold": 20.0},
-    "last-layer, forgetting 0.05": LAST_LAYER | {"planner.forgetting": 0.05},
-    "evidence": {"planner.head_selection": "evidence"},
-    "last-layer, evidence": LAST_LAYER | {"planner.head_selection": "evidence"},
+ARMS = {
+    name: MEASURED[name]
+    for name in (
+        "none",
+        "last-layer",
+        "last-layer, change detection",
+        "last-layer, forgetting 0.05",
+        "evidence",
+        "last-layer, evidence",
+    )
 }
 """Settings that the run is tested with, by name."""
 

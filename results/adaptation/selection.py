@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from measure import LAST_LAYER, name_of
+from measure import ARMS, name_of
 
 from headway.data import Trajectory
 from headway.experiment.methods import config_to_control
@@ -25,7 +25,7 @@ COLUMNS = (
     "run", "env", "method", "seed", "rule", "group", "chosen_error", "best_error",
     "average_error", "wrong", "settling_steps", "settled",
 )  # fmt: skip
-DETECTING = LAST_LAYER | {"planner.change_threshold": 20.0}
+DETECTING = ARMS["last-layer, change detection"]
 RULES: dict[str, dict[str, Any]] = {
     "last 10": {},
     "last 1": {"planner.selection_length": 1},

@@ -120,7 +120,7 @@ def test_a_search_that_is_cut_off_answers_with_the_best_so_far():
     outcome = work.planner.act(state, OBS[None], work.now)
     # The same draws, those of the first two of four iterations, by hand.
     prepared = eqx.filter_jit(agent.prepare)(state, jnp.asarray(OBS[None]))
-    score = scoring(agent, prepared.dynamics, jnp.asarray(OBS[None]))
+    score = scoring(agent.task, agent.planner, prepared.dynamics, jnp.asarray(OBS[None]))
     optimizer = make_optimizer(agent.planner)
     search = optimizer.begin(state.search)
     for key in jax.random.split(prepared.plan_key, 4)[:2]:

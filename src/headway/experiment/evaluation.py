@@ -135,6 +135,11 @@ def evaluate_agent(
     return found, use
 
 
+def trajectories_of(tests: Tests) -> dict[str, list[Trajectory]]:
+    """The test episodes of each group, in their order."""
+    return {group: list(found.values()) for group, found in tests.items()}
+
+
 def episode_rows(config: Config, iteration: int, tests: Tests) -> list[EpisodeRow]:
     """Turn test episodes into rows of `evaluation.csv`."""
     return [

@@ -11,7 +11,7 @@ import jax
 from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import unknown_name
-from headway.experiment.evaluation import Tests, evaluate_agent
+from headway.experiment.evaluation import Tests, evaluate_agent, trajectories_of
 from headway.experiment.limits import check_memory
 from headway.experiment.loading import load_agent, need_of
 from headway.experiment.methods import config_to_evaluate
@@ -38,7 +38,7 @@ class Tested:
     @property
     def trajectories(self) -> dict[str, list[Trajectory]]:
         """By group, in the order of the episodes."""
-        return {group: list(found.values()) for group, found in self.tests.items()}
+        return trajectories_of(self.tests)
 
 
 def run_tests(

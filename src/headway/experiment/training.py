@@ -15,7 +15,7 @@ from headway.data import ReplayBuffer, Trajectory
 from headway.errors import BadEnvironmentError, DivergenceError
 from headway.experiment.bad_episodes import BadEpisodes
 from headway.experiment.divergence import SLOWER, diverged, divergence, first_non_finite
-from headway.experiment.evaluation import Tests, episode_rows, evaluate_agent
+from headway.experiment.evaluation import Tests, episode_rows, evaluate_agent, trajectories_of
 from headway.experiment.learners import Fit, Learned, Learner, make_learner
 from headway.experiment.limits import check_memory
 from headway.experiment.loading import initial, load_learned, need_of
@@ -162,7 +162,9 @@ class Trainer:
             "iteration": iteration,
             "timesteps": self.buffer.num_transitions,
             **learning,
-            "evaluation": {group: _summary([*found.values()]) for group, found in tests.items()},
+            "evaluation": {
+                group: _summary(found) for group, found in trajectories_of(tests).items()
+            },
             "test_planner_failures": test_use.failures,
             "seconds": self.store.seconds,
         }
@@ -295,7 +297,7 @@ class Trainer:
         run, config, learner = self.run, self.config, self.learner
         arrays.save_tree(run.checkpoint(iteration), self.learned)
         run.append_evaluation(episode_rows(config, iteration, tests))
-        tested = {group: list(found.values()) for group, found in tests.items()}
+        tested = trajectories_of(tests)
         run.save_tests(iteration, tested)
         shares = learner.head_shares(self.learned, self.buffer.trajectories)
         run.append_assignments([{"iteration": iteration, **row} for row in shares])

@@ -21,12 +21,11 @@ from headway.envs.futures import RobotFutures
 from headway.envs.vector_worlds import ClassicVectorEnv, RolloutVectorEnv
 from headway.errors import ConfigError
 from headway.experiment.rollouts import Arena
-from headway.planning.acting import Physics
+from headway.planning.acting import Decision, Physics
 from headway.planning.controller import env_action
 from headway.planning.imagination import over_rows
 from headway.planning.optimizers import Plan, SearchState, make_optimizer
-from headway.planning.returns import RolloutSettings, candidate_returns
-from headway.planning.step import Decision
+from headway.planning.step import scoring
 from headway.tasks.base import Task
 
 
@@ -140,11 +139,7 @@ def _plan(
 ) -> Plan:
     dynamics = ClassicDynamics(states, sim_params, world)
     obs = world.observe(states, jnp)
-    settings = RolloutSettings.of(planner, dynamics.num_members)
-
-    def score(candidates, key):
-        return candidate_returns(dynamics, task, obs, candidates, settings=settings, key=key)
-
+    score = scoring(task, planner, dynamics, obs)
     return make_optimizer(planner).optimize(score, search, key=key)
 
 

@@ -7,13 +7,26 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from headway.planning.step import Decision
 from headway.tasks.base import Task
 
 Physics = Sequence[Mapping[str, float]]
 """Simulator parameters of each environment, by name."""
+
+
+class Decision(NamedTuple):
+    """What an agent decided in one step."""
+
+    action: Float[Array, "env action"]
+    """The action to take, in [-1, 1]."""
+    heads: Int[Array, "env member"] | None
+    """The head each member plans with; with `average`, the one that would be adaptive. None
+    where a model has no heads."""
+    failures: Int[Array, " env"]
+    """Planner iterations without any finite return."""
+    evaluations: Int[Array, " env"]
+    """Candidates whose return was imagined, each with `num_particles` rollouts."""
 
 
 @runtime_checkable

@@ -13,6 +13,7 @@ from headway.config import PlannerConfig
 from headway.data import sim_params_row
 from headway.errors import ConfigError
 from headway.models.dynamics import MultiHeadDynamics, Statistics
+from headway.planning.acting import Decision
 from headway.planning.devices import whole_on_each
 from headway.planning.heads import RecentTransitions, head_errors, select_heads
 from headway.planning.imagination import ImaginedDynamics
@@ -26,7 +27,7 @@ from headway.planning.last_layer.learning import (
 )
 from headway.planning.last_layer.regression import Prior
 from headway.planning.optimizers import Plan, SearchState, make_optimizer, where_env
-from headway.planning.step import Decision, act
+from headway.planning.step import act
 from headway.tasks.base import Task
 
 

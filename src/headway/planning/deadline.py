@@ -18,8 +18,9 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from headway.errors import ConfigError
 from headway.models.compilation import jit_networks
+from headway.planning.acting import Decision
 from headway.planning.optimizers import make_optimizer
-from headway.planning.step import Decision, Planning, scoring
+from headway.planning.step import Planning, scoring
 
 REMEMBERED = 32
 """Calls whose durations are remembered."""
@@ -141,7 +142,7 @@ def _iterate(
     iteration: int,
 ) -> tuple[Any, Bool[Array, " env"]]:
     optimizer = make_optimizer(agent.planner)
-    score = scoring(agent, prepared.dynamics, obs)
+    score = scoring(agent.task, agent.planner, prepared.dynamics, obs)
     search = optimizer.iterate(score, search, key, iteration)
     return search, optimizer.settled(search)
 

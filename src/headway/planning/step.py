@@ -1,29 +1,16 @@
 """One step of an agent that plans: prepare, search for the best action sequence, decide."""
 
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.config import PlannerConfig
 from headway.models.compilation import jit_networks
+from headway.planning.acting import Acting, Decision
 from headway.planning.optimizers import Plan, Score, SearchState, make_optimizer
 from headway.planning.returns import Dynamics, RolloutSettings, candidate_returns
 from headway.tasks.base import Task
-
-
-class Decision(NamedTuple):
-    """What an agent decided in one step."""
-
-    action: Float[Array, "env action"]
-    """The action to take, in [-1, 1]."""
-    heads: Int[Array, "env member"] | None
-    """The head each member plans with; with `average`, the one that would be adaptive. None
-    where a model has no heads."""
-    failures: Int[Array, " env"]
-    """Planner iterations without any finite return."""
-    evaluations: Int[Array, " env"]
-    """Candidates whose return was imagined, each with `num_particles` rollouts."""
 
 
 class Known(Protocol):
@@ -50,26 +37,15 @@ class PlanState(Protocol):
 
 
 @runtime_checkable
-class Planning(Protocol):
-    """An agent that plans. Its step is in parts, so that a search can be cut off."""
+class Planning(Acting, Protocol):
+    """An agent that plans. Its step is in parts, so that a search can be cut off.
 
-    @property
-    def task(self) -> Task:
-        """What the agent knows of the environment."""
-        ...
+    What it remembers is a `PlanState`.
+    """
 
     @property
     def planner(self) -> PlannerConfig:
         """Settings of the planner."""
-        ...
-
-    @property
-    def sim_param_names(self) -> tuple[str, ...]:
-        """See `Acting.sim_param_names`."""
-        ...
-
-    def init(self, num_envs: int, *, key: PRNGKeyArray, sim_params: Any = None) -> Any:
-        """See `Acting.init`; returns a `PlanState`."""
         ...
 
     def prepare(self, state: Any, obs: Float[Array, "env obs"]) -> Any:
@@ -83,12 +59,14 @@ class Planning(Protocol):
         ...
 
 
-def scoring(agent: Planning, dynamics: Dynamics, obs: Float[Array, "env obs"]) -> Score:
+def scoring(
+    task: Task, planner: PlannerConfig, dynamics: Dynamics, obs: Float[Array, "env obs"]
+) -> Score:
     """Returns of candidates, imagined from where each environment is now."""
-    settings = RolloutSettings.of(agent.planner, dynamics.num_members)
+    settings = RolloutSettings.of(planner, dynamics.num_members)
 
     def score(candidates, key):
-        return candidate_returns(dynamics, agent.task, obs, candidates, settings=settings, key=key)
+        return candidate_returns(dynamics, task, obs, candidates, settings=settings, key=key)
 
     return score
 
@@ -102,7 +80,7 @@ def act(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[Any,
 def _act(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[Any, Decision]:
     prepared = agent.prepare(state, obs)
     # Imagine candidates, and search for the best action sequence.
-    score = scoring(agent, prepared.dynamics, obs)
+    score = scoring(agent.task, agent.planner, prepared.dynamics, obs)
     optimizer = make_optimizer(agent.planner)
     plan = optimizer.optimize(score, state.search, key=prepared.plan_key)
     return agent.decide(state, obs, prepared, plan)

@@ -199,8 +199,9 @@ def doubt(
     if not agent.planner.adaptation_variance or agent.prior is None:
         return None
     choices = heads.shape[-1]
-    roots = [root_of(layer, heads[..., choice]) for choice in range(choices)]
-    root = jnp.concatenate(roots, axis=-1) / choices
+    distinct = choices if layer.root.shape[2] > 1 else 1  # else all heads have the same root
+    roots = [root_of(layer, heads[..., choice]) for choice in range(distinct)]
+    root = jnp.concatenate(roots, axis=-1) / (choices * distinct) ** 0.5
     rest = jnp.ones((*root.shape[:2], 1))
     if context is not None and agent.model.forward_net.context_layer is None:
         rest = jnp.concatenate([context.transpose(1, 0, 2), rest], axis=-1)

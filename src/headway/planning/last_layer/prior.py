@@ -154,11 +154,13 @@ def _of_member(seen: Seen, member: int, rank: Rank) -> _OfMember:
 def _most_likely(
     looks: Callable[[], Iterator[list[_OfMember]]], num_members: int, *, head_noise: bool
 ) -> Prior:
-    """The prior of every member, in two looks at the episodes."""
-    references = _mean_logvar(looks())
-    used = references if head_noise else [None] * num_members
-    parts = [[*map(_reduced, episode, used)] for episode in looks()]
-    priors = []
+    """The prior of every member; where the noise is relative, in two looks at the episodes."""
+    used = _mean_logvar(map(_claims, looks())) if head_noise else [None] * num_members
+    parts, claims = [], []
+    for episode in looks():
+        parts.append([*map(_reduced, episode, used)])
+        claims.append(_claims(episode))
+    references, priors = _mean_logvar(claims), []
     for member in range(num_members):
         evidence = Evidence.joined([episode[member] for episode in parts])
         ratio = evidence.best_ratio()
@@ -167,10 +169,14 @@ def _most_likely(
     return Prior(*(jnp.asarray(column, jnp.float32) for column in columns))
 
 
-def _mean_logvar(episodes: Iterable[list[_OfMember]]) -> list[float]:
-    """What each member's heads claim on average, as a log-variance."""
-    found = [[(one.logvar.sum(), len(one.logvar)) for one in episode] for episode in episodes]
-    sums = np.asarray(found, np.float64).sum(0)
+def _claims(episode: list[_OfMember]) -> list[tuple[float, int]]:
+    """Sum and number of the log-variances that each member's head claims in an episode."""
+    return [(one.logvar.sum(), len(one.logvar)) for one in episode]
+
+
+def _mean_logvar(claims: Iterable[list[tuple[float, int]]]) -> list[float]:
+    """What each member's heads claim on average over episodes, as a log-variance."""
+    sums = np.asarray([*claims], np.float64).sum(0)
     return (sums[:, 0] / sums[:, 1]).tolist()
 
 

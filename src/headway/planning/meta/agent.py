@@ -10,12 +10,12 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from headway.config import PlannerConfig
 from headway.models.dynamics import Statistics
-from headway.planning.acting import Physics
+from headway.planning.acting import Decision, Physics
 from headway.planning.heads import RecentTransitions
 from headway.planning.meta.models import AdaptiveModel, Transition
 from headway.planning.optimizers import Plan, SearchState, make_optimizer
 from headway.planning.returns import Dynamics, follow
-from headway.planning.step import Decision, act
+from headway.planning.step import act
 from headway.tasks.base import Task
 
 
@@ -43,11 +43,6 @@ class AdaptiveAgent(eqx.Module):
     def statistics(self) -> Statistics | None:
         """Normalisers of the training data; None for a model that has none."""
         return getattr(self.model, "statistics", None)
-
-    @property
-    def method(self) -> str:
-        """The name of the method that made the model."""
-        return self.model.method
 
     def init(
         self, num_envs: int, *, key: PRNGKeyArray, sim_params: Physics | None = None

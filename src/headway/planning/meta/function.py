@@ -30,7 +30,6 @@ class FunctionModel(eqx.Module):
     parameters: Any
     predict: Predict = eqx.field(static=True)
     widest: int = eqx.field(static=True, default=256)
-    method = "a model that is one function"
 
     def start(self, num_envs: int) -> tuple[()]:
         """See `AdaptiveModel.start`."""

@@ -33,11 +33,6 @@ class Transition(NamedTuple):
 class AdaptiveModel(Protocol):
     """A model that learns from the present episode."""
 
-    @property
-    def method(self) -> str:
-        """The name of the method that made it."""
-        ...
-
     def start(self, num_envs: int) -> Any:
         """Know nothing of the episodes yet; arrays lead with the environments."""
         ...
@@ -62,7 +57,6 @@ class GradientAdapted(eqx.Module):
     task: Task
     length: int = eqx.field(static=True)
     rate: float = eqx.field(static=True)
-    method = "grbal"
 
     def start(self, num_envs: int) -> RecentTransitions:
         """See `AdaptiveModel.start`."""
@@ -142,7 +136,6 @@ class Recurrent(eqx.Module):
     net: RecurrentNet
     statistics: Statistics
     task: Task
-    method = "rebal"
 
     def start(self, num_envs: int) -> tuple[CellState, ...]:
         """See `AdaptiveModel.start`."""
