@@ -68,27 +68,6 @@ def test_only_oracle_params_is_told_the_physics():
     assert told_sim_params(config) == ("mass", "length")
 
 
-SPREAD = [
-    ("stacked", "hopper"),
-    ("cadm", "cartpole-swingup"),
-    ("pets-cadm", "half-cheetah"),
-    ("oracle-params", "crippled-ant"),
-    ("ria", "slim-humanoid"),
-]
-
-
-@pytest.mark.parametrize(("method", "env"), SPREAD)
-def test_smoke_run_of_every_method(method, env, tmp_path):
-    config = make_config(env, method=method, preset="smoke", settings=TINY)
-    run = training.train_run(config, tmp_path / "run")
-    metrics = run.metrics()
-    assert [m["iteration"] for m in metrics] == [0, 1]
-    assert np.isfinite([m["fitting"]["loss"] for m in metrics]).all()
-    assert sum(m["fitting"]["skipped_updates"] for m in metrics) == 0
-    assert np.isfinite([row.episode_return for row in run.evaluation()]).all()
-    assert {row.group for row in run.evaluation()} >= set(headway.env_spec(env).sim_params.unseen)
-
-
 NO_CONTEXT = {"model.context_size": 0, "model.backward_net": False}
 ABLATIONS = [
     ("tmcl", {**NO_CONTEXT, "fitting.segment_length": 5, "model.num_heads": 2}),

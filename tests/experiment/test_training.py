@@ -59,10 +59,9 @@ def test_smoke_run_and_evaluation_of_every_unseen_group(env, tmp_path):
         assert np.isfinite([row.episode_return for row in rows]).all()
 
 
-@pytest.mark.parametrize("method", ["tmcl-bayes", "mcl", "pets", "mh-pets", "vanilla"])
-def test_smoke_run_of_every_other_method(method, tmp_path):
+def test_groups_are_tested_when_the_settings_say(tmp_path):
     run = headway.train(
-        "pendulum", method=method, preset="smoke", run_dir=tmp_path / method, settings=TINY
+        "pendulum", method="vanilla", preset="smoke", run_dir=tmp_path, settings=TINY
     )
     assert len(run.evaluation) == 2 * 2 + 3 * 2  # low and high twice, training physics at the end
 

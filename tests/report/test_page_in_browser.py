@@ -2,6 +2,7 @@
 
 import io
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from headway.report.page.build import write_report
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "google-chrome"))), None
 )
+SAMPLE = Path(__file__).parent.parent / "data" / "run-schema-2"
 WIDTHS = {"desktop": (1280, 900), "phone": (360, 780)}
 PAPER = {"light": (255, 255, 255), "dark": (0x17, 0x18, 0x1C)}
 
@@ -31,12 +33,19 @@ def browser():
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory, write_run):
-    """Ten methods, so that legend and tables are crowded; one run is half finished."""
+    """Ten methods, so that legend and tables are crowded; one run is half finished.
+
+    Two have three seeds, and so intervals; one run was really trained, and has contexts to show.
+    """
     root = tmp_path_factory.mktemp("browser")
     for index in range(10):
         method = "tmcl" if index == 0 else f"method-number-{index}"
         heads = 3 if index < 2 else 1
         write_run(root / f"runs/{method}", method=method, heads=heads, evaluated=(1, 4))
+        for seed in (1, 2) if index in (0, 2) else ():
+            place = root / f"runs/{method}-{seed}"
+            write_run(place, method=method, heads=heads, evaluated=(1, 4), seed=seed)
+    shutil.copytree(SAMPLE, root / "runs/trained")
     metrics = root / "runs/method-number-1/metrics.jsonl"
     metrics.write_text("".join(metrics.read_text().splitlines(keepends=True)[:2]))
     return write_report([root / "runs"], root / "report.html")
@@ -70,6 +79,22 @@ def test_it_fits_the_window_and_asks_for_nothing(opened, report):
     assert opened.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
     assert opened.said == []
     assert opened.asked == [report.as_uri()]
+
+
+def test_every_kind_of_figure_is_there(opened):
+    """Shaded intervals, bars, head shares, contexts and errors are drawn, and take up room."""
+    for chapter in ("learning-curves", "groups", "head-shares", "contexts", "prediction-error"):
+        boxes = opened.evaluate(
+            """(id) => [...document.querySelectorAll(`#${id} figure svg`)].map((svg) => {
+                const box = svg.getBoundingClientRect(); return [box.width, box.height];})""",
+            chapter,
+        )
+        assert boxes, chapter
+        assert min(min(box) for box in boxes) > 60, chapter
+    assert opened.evaluate("document.body.innerText.includes('has no contexts to show')")
+    bands = "#learning-curves figure svg [style*='fill-opacity: 0.16']"
+    assert opened.locator(bands).count() == 2 * 4  # two methods with three seeds
+    assert opened.locator("#contexts figure svg use").count() == 8 + 3  # moments, and the legend
 
 
 def test_texts_of_figures_can_be_read_and_stay_inside(opened):
@@ -116,4 +141,4 @@ def test_numbers_are_copied(opened):
         "(t => t.value.slice(t.selectionStart, t.selectionEnd))(document.querySelector('textarea'))"
     )
     assert selected.startswith("env,method,seed")
-    assert selected.count("\n") == 1 + 9 * 8
+    assert selected.count("\n") == 1 + (9 + 4) * 8

@@ -59,6 +59,21 @@ def test_variants_of_a_method_are_told_apart(tmp_path, write_run):
     assert "planner.horizon" in page
 
 
+def test_a_dash_stands_for_a_setting_that_a_method_cannot_use(tmp_path, write_run):
+    for method, heads, length in (("tmcl", 3, 10), ("mcl", 3, 5), ("pets", 1, 7)):
+        changed = {
+            "model.num_heads": heads,
+            "fitting.segment_length": length,
+            "fitting.warmup_iterations": 3 if heads > 1 else 2,
+        }
+        write_run(tmp_path / method, method=method, settings_changed=changed)
+    page = write_report([tmp_path], tmp_path / "report.html", only=["settings"]).read_text()
+    rows = [re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row) for row in page.split("<tr")]
+    row = next(row for row in rows if row and "fitting.segment_length" in row[0])
+    assert row[1:] == ["10", "5", "–"]
+    assert "fitting.warmup_iterations" not in page  # all that use it agree
+
+
 def test_presets_explain_what_follows_them(tmp_path, write_run):
     for preset, iterations in (("quick", 5), ("paper", 10)):
         for seed in range(2):

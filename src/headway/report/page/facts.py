@@ -1,6 +1,8 @@
 """The chapters of the page that say how its numbers came about."""
 
 import shlex
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -10,8 +12,7 @@ from headway.report.page.parts import Block, Cell, Line, Panel, Section, Table, 
 from headway.report.page.runs import PHYSICS_FILE, LoadedRun, physics_file, train_command
 from headway.report.page.series import (
     Comparison,
-    differing_settings,
-    run_settings,
+    used_settings,
     value_text,
 )
 from headway.storage.records import csv_lines
@@ -23,8 +24,9 @@ _TEXTS = ("env", "method", "group", "sim_params")
 def settings(comparison: Comparison) -> Section:
     """The settings in which the runs of an environment differ."""
     lead = (
-        "Settings that are not the same in all runs of an environment, seeds and what is tolerated"
-        " of environments that break aside. Everything else that the runs use is equal."
+        "Settings that are not the same in all runs that use them, by environment; seeds and what"
+        " is tolerated of environments that break aside. A dash stands where a method has no use"
+        " for a setting. Everything else that the runs use is equal."
     )
     blocks = [_settings_of(comparison, env) for env in comparison.envs]
     return Section("settings", "Settings that differ", lead, blocks)
@@ -32,8 +34,8 @@ def settings(comparison: Comparison) -> Section:
 
 def _settings_of(comparison: Comparison, env: str) -> Block:
     series = comparison.series_of(env)
-    tables = [run_settings(comparison.runs_of(env, one)[0]) for one in series]
-    names = [name for name in differing_settings(tables) if name not in ("method", "seed")]
+    tables = [used_settings(comparison.runs_of(env, one)[0]) for one in series]
+    names = [name for name in _disputed(tables) if name not in ("method", "seed")]
     if not names:
         return Block(env, texts=["All runs have the same settings."])
     lines = [
@@ -41,6 +43,13 @@ def _settings_of(comparison: Comparison, env: str) -> Block:
         for name in names
     ]
     return Block(env, table=Table(["setting", *(one.label for one in series)], lines))
+
+
+def _disputed(tables: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Names of the settings that not all tables which have them agree on."""
+    names = dict.fromkeys(name for table in tables for name in table)
+    given = {name: [table[name] for table in tables if name in table] for name in names}
+    return [name for name, values in given.items() if any(v != values[0] for v in values)]
 
 
 def times(comparison: Comparison) -> Section:

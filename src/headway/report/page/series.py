@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from headway import settings
+from headway.config.unused import unused_settings
 from headway.experiment.methods import METHODS
 from headway.report.page.runs import LoadedRun, Note
 from headway.report.page.scoring import (
@@ -202,6 +203,12 @@ def differing_settings(values: Sequence[Mapping[str, Any]]) -> list[str]:
 def run_settings(run: LoadedRun) -> dict[str, Any]:
     """All settings of a run by dotted name; those that it cannot use stand at their defaults."""
     return settings.relevant(run.config)
+
+
+def used_settings(run: LoadedRun) -> dict[str, Any]:
+    """The settings that make a difference to a run, by dotted name."""
+    unused = unused_settings(run.config)
+    return {name: value for name, value in run_settings(run).items() if name not in unused}
 
 
 def _settings(run: LoadedRun) -> dict[str, Any]:
