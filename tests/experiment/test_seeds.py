@@ -31,7 +31,8 @@ QUICK_TO_COMPILE = {
     **killing.TINY,
     "fitting.warmup_iterations": 0,
     "model.hidden_sizes": (8,),
-    "model.context_size": 0,
+    "model.context_size": 2,
+    "model.context_hidden_sizes": (4,),
     "model.backward_net": False,
 }
 
