@@ -226,3 +226,28 @@ def test_the_estimate_is_within_a_factor_of_two_of_the_peak(size):
     total += max(parts["fitting"], parts["planning"])
     print(f"{size}: estimated {total / GIB:.2f} GiB, measured {found['peak'] / GIB:.2f} GiB", parts)
     assert 0.5 < total / found["peak"] < 2.0
+
+
+@pytest.mark.parametrize("work", ["train", "evaluate"])
+def test_programs_are_forgotten_before_linux_refuses_more_of_them(work, monkeypatch, tmp_path):
+    maps, allowed, cleared = tmp_path / "maps", tmp_path / "max", []
+    monkeypatch.setattr(limits, "MAPS", maps)
+    monkeypatch.setattr(limits, "MAX_MAPS", allowed)
+    monkeypatch.setattr(limits.jax, "clear_caches", lambda: cleared.append(1))
+    sample = Path(__file__).parents[1] / "data" / "run-schema-2"
+
+    def begin():
+        if work == "evaluate":
+            api.evaluate(sample, settings={"planner.num_candidates": 10**8})
+        settings = {"planner.num_candidates": 10**8}
+        config = make_config("pendulum", preset="smoke", settings=settings)
+        training.train_run(config, tmp_path / "run")
+
+    for count, times in ((0, 0), (49, 0), (50, 1)):
+        allowed.write_text("100\n")
+        maps.write_text("7f00-7f01 r-xp\n" * count)
+        with pytest.raises(LimitError):  # which is looked at afterwards
+            begin()
+        assert len(cleared) == times
+    allowed.unlink()  # another system
+    assert not limits.make_room_for_programs()

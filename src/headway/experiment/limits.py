@@ -1,4 +1,4 @@
-"""Memory: what a run will need, and what the machine has free, compared before it starts."""
+"""Memory: what a run will need, and what is free, compared before it starts."""
 
 import itertools
 from pathlib import Path
@@ -21,6 +21,8 @@ CGROUP = Path("/proc/self/cgroup")
 CGROUP_ROOT = Path("/sys/fs/cgroup")
 STATM = Path("/proc/self/statm")
 PAGE = 4096
+MAPS = Path("/proc/self/maps")
+MAX_MAPS = Path("/proc/sys/vm/max_map_count")
 TRY = (
     "choose smaller sizes, or give `headway train` --ignore-limits (ignore_limits=True) to try all"
     " the same."
@@ -211,6 +213,28 @@ def resident() -> int:
         return int(STATM.read_text().split()[1]) * PAGE
     except (OSError, ValueError, IndexError):
         return 0
+
+
+def make_room_for_programs() -> bool:
+    """Forget all compiled programs if this process is half-way to its limit of memory maps.
+
+    JAX keeps what it compiled for ever, which is about a thousand maps for a run, and crashes
+    beyond what Linux allows (65,530 by default). What is needed again is compiled again, or read
+    from the persistent cache; a controller in the same process then answers late once.
+
+    Returns:
+        Whether they were forgotten.
+    """
+    try:
+        allowed = int(MAX_MAPS.read_text())
+        with MAPS.open("rb") as lines:
+            used = sum(1 for _ in lines)
+    except (OSError, ValueError):  # no Linux
+        return False
+    if 2 * used < allowed:
+        return False
+    jax.clear_caches()
+    return True
 
 
 def free_memory() -> int | None:

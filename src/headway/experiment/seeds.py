@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from headway.config import Config
 from headway.errors import ConfigError, HeadwayError, SeedsError
-from headway.experiment.limits import check_memory
+from headway.experiment.limits import check_memory, make_room_for_programs
 from headway.experiment.loading import learner_of, load_task, need_of
 from headway.experiment.methods import check_block
 from headway.experiment.progress import Progress
@@ -130,6 +130,7 @@ def _side_by_side(
     jobs: Sequence[_Job], progress: Progress, options: Mapping[str, bool]
 ) -> dict[int, HeadwayError]:
     """Train every run in a thread of its own; return why some failed."""
+    make_room_for_programs()
     if not options["ignore_limits"]:
         check_memory(need_of(jobs[0].config).times(len(jobs)), may_ignore=True)
     with progress as shown, contextlib.ExitStack() as held:

@@ -12,7 +12,7 @@ from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import unknown_name
 from headway.experiment.evaluation import Tests, evaluate_agent, trajectories_of
-from headway.experiment.limits import check_memory
+from headway.experiment.limits import check_memory, make_room_for_programs
 from headway.experiment.loading import load_agent, need_of
 from headway.experiment.methods import config_to_evaluate
 from headway.experiment.progress import Progress
@@ -70,6 +70,7 @@ def run_tests(
     if num_episodes is not None:
         changes["evaluation.num_episodes"] = num_episodes
     config = config_to_evaluate(run.config(), changes)
+    make_room_for_programs()
     check_memory(need_of(config).to_test)
     arena = Arena.make(config)
     with progress or Progress() as shown, closing(arena):

@@ -17,7 +17,7 @@ from headway.experiment.bad_episodes import BadEpisodes
 from headway.experiment.divergence import SLOWER, diverged, divergence, first_non_finite
 from headway.experiment.evaluation import Tests, episode_rows, evaluate_agent, trajectories_of
 from headway.experiment.learners import Fit, Learned, Learner, make_learner
-from headway.experiment.limits import check_memory
+from headway.experiment.limits import check_memory, make_room_for_programs
 from headway.experiment.loading import initial, load_learned, need_of
 from headway.experiment.methods import check_block
 from headway.experiment.progress import Progress
@@ -339,6 +339,7 @@ def train_run(
     """
     check_block(config)
     run = RunDir(run_dir)
+    make_room_for_programs()
     if not ignore_limits:
         check_memory(need_of(config), may_ignore=True)
     # A display begins once it is certain that the run does.
