@@ -18,12 +18,13 @@ TINY = {
 }
 ENVS = tuple(env_names())
 PAIRS = [(method, env) for method in METHODS for env in ENVS]
+TRAINED_ELSEWHERE = {"tmcl", "grbal", "rebal", "true-dynamics"}  # by default too
 
 
 def is_quick(method: str, env: str) -> bool:
     """One environment for each method, in turn, and all of them for what compiles nothing."""
     turn = list(METHODS).index(method) % len(ENVS)
-    return method == "random" or ENVS[turn] == env
+    return method == "random" or (ENVS[turn] == env and method not in TRAINED_ELSEWHERE)
 
 
 def marked(method: str, env: str):
@@ -53,5 +54,5 @@ def test_smoke_run(method, env, tmp_path):
 
 def test_every_method_and_every_environment_is_quick_somewhere():
     quick = [pair for pair in PAIRS if is_quick(*pair)]
-    assert {method for method, _ in quick} == set(METHODS)
+    assert {method for method, _ in quick} == {*METHODS} - TRAINED_ELSEWHERE
     assert {env for _, env in quick} == set(ENVS)
