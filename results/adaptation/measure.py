@@ -47,7 +47,6 @@ ARMS: dict[str, dict[str, Any]] = {
     "last-layer, forgetting 0.001": LAST_LAYER | {"planner.forgetting": 0.001},
     "last-layer, change detection": LAST_LAYER | {"planner.change_threshold": 20.0},
     "foresight": FORESIGHT,
-    "foresight of the runner-up": FORESIGHT | {"planner.adaptation_prior": "runner-up"},
     "foresight, change detection": FORESIGHT | {"planner.change_threshold": 20.0},
     "foresight, forgetting 0.05": FORESIGHT | {"planner.forgetting": 0.05},
 }

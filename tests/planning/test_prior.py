@@ -129,42 +129,62 @@ def residuals(features, residual):
     return Residuals(features, residual, np.zeros(len(features)), 0)
 
 
-def test_errors_ahead_are_those_of_regression():
+@pytest.mark.parametrize("steps", [3, 5])  # fewer than features, and more
+@pytest.mark.parametrize("reference", [None, -1.0])
+def test_errors_ahead_are_those_of_regression(steps, reference):
     rng = np.random.default_rng(0)
     features, residual = rng.normal(size=(9, 4)), rng.normal(size=(9, 2))
-    learned, later = residuals(features[:5], residual[:5]), residuals(features[5:], residual[5:])
-    found = foresight.errors_ahead(learned, later)
-    for ratio, error in zip(foresight.TRIED, found, strict=True):
-        gram = features[:5].T @ features[:5] + np.eye(4) / ratio
-        weight = np.linalg.solve(gram, features[:5].T @ residual[:5])
-        left = residual[5:] - features[5:] @ weight
-        assert error == pytest.approx(np.square(left).mean(), rel=1e-5)
+    root, logvar = rng.normal(size=(4, 4)), rng.normal(size=9)
+    one = Residuals(features, residual, logvar, 0)
+    learned, later = one.part(slice(steps)), one.part(slice(steps, None))
+    noise = np.ones(steps) if reference is None else np.exp(logvar[:steps] - reference)
+    for ratio, error in zip(
+        foresight.RATIOS, foresight.errors_ahead(learned, later, root, reference), strict=True
+    ):
+        precision = np.linalg.inv(ratio * root @ root.T)
+        gram = (features[:steps] / noise[:, None]).T @ features[:steps] + precision
+        weight = np.linalg.solve(gram, features[:steps].T @ (residual[:steps] / noise[:, None]))
+        left = residual[steps:] - features[steps:] @ weight
+        assert error == pytest.approx(np.square(left).mean(), rel=1e-4)
 
 
-def test_moments_are_log_uniform_and_leave_something_to_foresee():
-    found = np.array([foresight.moments_of(200, i) for i in range(1000)])
-    assert found.min() == 1
-    assert found.max() == 199
-    assert np.mean(found < 200**0.5) == pytest.approx(0.5, abs=0.02)
-    assert np.mean(found < 200**0.25) == pytest.approx(0.25, abs=0.05)
-    assert foresight.moments_of(2, 0) == [1] * foresight.MOMENTS
-    assert foresight.moments_of(1, 0) == []
+@pytest.mark.parametrize("power", foresight.POWERS)
+def test_directions_are_spread_by_how_much_they_vary(power):
+    rng = np.random.default_rng(0)
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    rows = [residuals(rng.normal(size=(40, 3)) @ turn.T * [1.0, 0.1, 3.0], np.zeros((40, 1)))]
+    [found] = foresight.directions_of([rows, rows])
+    moment = rows[0].features.T @ rows[0].features / 40
+    root = found.root(power)
+    np.testing.assert_allclose(root @ found.inverse(power), np.eye(3), atol=1e-9)
+    values, vectors = np.linalg.eigh(moment)
+    shape = vectors @ np.diag(values**-power) @ vectors.T
+    expected = shape / np.trace(shape @ moment)
+    np.testing.assert_allclose(root @ root.T, expected, rtol=1e-6, atol=1e-12)
+
+
+def test_directions_that_never_vary_have_a_floor():
+    found = foresight.Directions.of(np.diag([1.0, 0.0]))
+    assert np.isfinite(found.root(1.0)).all()
 
 
 def foreseen_best(rows, horizon=10):
     """The ratio that foresight takes for some episodes of one member."""
-    cut = []
-    for i, (features, residual, _) in enumerate(rows):
-        one = residuals(features, residual)
+    cut, known = [], [[residuals(features, residual)] for features, residual, _ in rows]
+    for i, [one] in enumerate(known):
         for moment in foresight.moments_of(STEPS, i):
             cut.append(([one.part(slice(moment))], [one.part(slice(moment, None))]))
-    return foresight.best_ratio(cut, horizon, [None])
+    directions = foresight.directions_of(known)
+    return foresight.best([foresight.relative_errors(cut, directions, horizon, [None])])
 
 
-def test_foresight_finds_about_the_prior_that_made_the_data():
-    for ratio in (0.01, 1.0, 300.0):
-        found = foreseen_best(episodes(ratio, 0.1, count=60))
-        assert ratio / 10 < found < ratio * 10
+@pytest.mark.parametrize("ratio", [0.01, 1.0, 300.0])
+def test_foresight_finds_about_the_prior_that_made_the_data(ratio):
+    rows = episodes(ratio, 0.1, count=60)
+    power, found = foreseen_best(rows)
+    scale = np.mean([np.square(features).sum(-1) for features, _, _ in rows])
+    assert power == 0.0
+    assert ratio / 5 < found / scale < ratio * 5
 
 
 def test_what_explains_an_episode_but_predicts_nothing_is_not_trusted():
@@ -175,6 +195,23 @@ def test_what_explains_an_episode_but_predicts_nothing_is_not_trusted():
         features, residual = rng.normal(size=(15, 40)), rng.normal(size=(15, OBS))
         held = (np.repeat(x, 2, axis=0) for x in (features, residual))
         rows.append((*held, np.ones(STEPS)))
-    likely = Evidence.of(rows).best_ratio()
-    assert likely > 1e3
-    assert foreseen_best(rows) < 1e-2
+    assert Evidence.of(rows).best_ratio() > 1e3
+    assert foreseen_best(rows)[1] < 1.0
+
+
+def test_both_heads_count_in_units_of_their_own_errors():
+    owner, runner_up = np.full((2, *np.shape(foresight.RATIOS)), 2.0)[:, None]
+    owner[0, 3], runner_up[0, 7], owner[0, 9], runner_up[0, 9] = 0.9, 0.8, 1.0, 0.5
+    assert foresight.best([owner]) == (0.0, foresight.RATIOS[3])
+    assert foresight.best([runner_up]) == (0.0, foresight.RATIOS[9])
+    assert foresight.best([owner, runner_up]) == (0.0, foresight.RATIOS[9])
+
+
+def test_moments_are_log_uniform_and_leave_something_to_foresee():
+    found = np.array([foresight.moments_of(200, i) for i in range(1000)])
+    assert found.min() == 1
+    assert found.max() == 199
+    assert np.mean(found < 200**0.5) == pytest.approx(0.5, abs=0.02)
+    assert np.mean(found < 200**0.25) == pytest.approx(0.25, abs=0.05)
+    assert foresight.moments_of(2, 0) == [1] * foresight.MOMENTS
+    assert foresight.moments_of(1, 0) == []

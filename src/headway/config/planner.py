@@ -79,7 +79,8 @@ class PlannerConfig:
     each head's own variance says (last-layer)."""
     adaptation_prior: Literal["owner", "runner-up"] = "owner"
     """Which head's residuals on the training episodes the prior is fitted to: those of the head
-    that explains an episode best, or second best, as if it were of unseen physics (last-layer)."""
+    that explains an episode best, or second best, as if it were of unseen physics (last-layer);
+    foresight looks at both."""
     adaptation_criterion: Literal["likelihood", "foresight"] = "likelihood"
     """What the prior is chosen by: the likelihood of the training episodes, or how well the rest
     of an episode is foreseen, one horizon ahead, after learning from its beginning

@@ -1,9 +1,9 @@
 """What heads should expect to learn in an episode, from the training data.
 
-The prior of a correction has a ratio ρ of its variance to that of the noise. It is chosen on the
-training episodes, each of which is a task of its own: by how well the rest of an episode is
-foreseen once its beginning was learned from (`foresight`), or by empirical Bayes, the likelihood
-of all episodes (`evidence`). The noise σ² is the most likely one for that ratio.
+Each training episode is a task of its own. The prior of a correction is chosen by how well the
+rest of an episode is foreseen once its beginning was learned from (`foresight`), or by empirical
+Bayes, the likelihood of all episodes (`evidence`), all weights being equally uncertain then. The
+noise σ² is the most likely one for that prior.
 """
 
 from collections.abc import Iterable, Sequence
@@ -18,13 +18,14 @@ from headway.data import Trajectory
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.planning.last_layer import foresight
 from headway.planning.last_layer.evidence import Evidence
-from headway.planning.last_layer.regression import Prior
-from headway.planning.last_layer.residuals import Onlooker, Residuals
+from headway.planning.last_layer.regression import Prior, Shape
+from headway.planning.last_layer.residuals import Onlooker, Rank, Residuals
 from headway.tasks.base import Task
 
 MAX_EPISODES = 100
 """Episodes that are looked at, evenly spread over those collected; the paper's are all."""
 
+RANKS: tuple[Rank, ...] = ("owner", "runner-up")
 References = Sequence[float | None]
 Item = TypeVar("Item")
 
@@ -46,7 +47,7 @@ def fit_prior(
         statistics: The normalisers in use.
         trajectories: Episodes under training physics; which physics is not looked at.
         history_length: Past transitions that the context is made of (K).
-        planner: Says by what to choose (`adaptation_criterion`), whose residuals count
+        planner: Says by what to choose (`adaptation_criterion`), whose residuals are likely
             (`adaptation_prior`), what the noise is like, and how far plans look ahead.
     """
     onlooker = Onlooker(model, task, statistics, history_length, planner.adaptation_prior)
@@ -57,28 +58,47 @@ def fit_prior(
         relative: References = [None] * model.num_members
         if planner.adaptation_noise == "heads":
             relative = _mean_logvar(map(_claims, onlooker.episodes(chosen)))
-        evidence, references = _reduced(onlooker.episodes(chosen), relative)
+        shape, ratio = None, None
         if planner.adaptation_criterion == "foresight":
-            moments = [foresight.moments_of(len(t), i) for i, t in enumerate(chosen)]
-            foreseen = onlooker.from_moments(chosen, moments)
-            ratio = foresight.best_ratio(foreseen, planner.horizon, relative)
-            ratios = [ratio] * model.num_members
-        else:
-            ratios = [of_member.best_ratio() for of_member in evidence]
+            shape, ratio = _foreseen_best(onlooker, chosen, planner.horizon, relative)
+        evidence, references = _reduced(onlooker.episodes(chosen), relative, shape)
+        ratios = [of_member.best_ratio() if ratio is None else ratio for of_member in evidence]
     noise = [of_member.noise(r) for of_member, r in zip(evidence, ratios, strict=True)]
-    columns = (np.asarray(column) for column in (ratios, noise, references))
-    return Prior(*(jnp.asarray(column, jnp.float32) for column in columns))
+    columns = (jnp.asarray(np.asarray(x), jnp.float32) for x in (ratios, noise, references))
+    return Prior(*columns, shape)
+
+
+def _foreseen_best(
+    onlooker: Onlooker, trajectories: Sequence[Trajectory], horizon: int, references: References
+) -> tuple[Shape, float]:
+    """The spread over the features of each member and the ratio that foresee most."""
+    chosen = _spread(trajectories, foresight.MAX_EPISODES)
+    moments = [foresight.moments_of(len(t), i) for i, t in enumerate(chosen)]
+    directions = foresight.directions_of(onlooker.episodes(chosen))
+    errors = []
+    for rank in RANKS[: onlooker.model.num_heads]:
+        foreseen = onlooker._replace(rank=rank).from_moments(chosen, moments)
+        errors.append(foresight.relative_errors(foreseen, directions, horizon, references))
+    power, ratio = foresight.best(errors)
+    roots = np.stack([one.root(power) for one in directions])
+    inverses = np.stack([one.inverse(power) for one in directions])
+    return Shape(*(jnp.asarray(x, jnp.float32) for x in (roots, inverses))), ratio
 
 
 def _reduced(
-    episodes: Iterable[list[Residuals]], references: References
+    episodes: Iterable[list[Residuals]], references: References, shape: Shape | None
 ) -> tuple[list[Evidence], list[float]]:
     """What each member's likelihood depends on, and what its heads claim, in one look."""
+    roots = [None] * len(references) if shape is None else np.asarray(shape.root, np.float64)
     parts, claims = [], []
     for episode in episodes:
         rows = [
-            (one.features, one.residual, one.relative_noise(reference))
-            for one, reference in zip(episode, references, strict=True)
+            (
+                one.features if root is None else one.features @ root,
+                one.residual,
+                one.relative_noise(reference),
+            )
+            for one, reference, root in zip(episode, references, roots, strict=True)
         ]
         parts.append([Evidence.of([row]) for row in rows])
         claims.append(_claims(episode))
