@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 import toys
 from headway.config import PlannerConfig
@@ -16,11 +17,11 @@ from headway.planning.imagination import ImaginedDynamics
 from headway.planning.last_layer import learning
 from headway.planning.last_layer.learning import Learned
 from headway.planning.last_layer.regression import (
+    NOISE_DOF,
     LastLayer,
     Observed,
     Prior,
     Shape,
-    first_forecast,
     forecast,
     forget,
     log_likelihood,
@@ -64,6 +65,7 @@ def some_transitions(steps, groups=1, seed=0):
     rng = np.random.default_rng(seed)
     mixing = rng.normal(size=(FEATURES, FEATURES)) * np.geomspace(1.0, 0.01, FEATURES)
     features = rng.normal(size=(steps, ENVS, MEMBERS, FEATURES)) @ mixing
+    features[..., -1] = 1.0
     truth = rng.normal(size=(ENVS, MEMBERS, HEADS, FEATURES, OBS))
     residual = np.einsum("semi,emhio->semho", features, truth)
     residual += 0.1 * rng.normal(size=residual.shape)
@@ -158,18 +160,39 @@ def test_forgetting_is_the_drift_whose_stationary_distribution_is_the_prior(shap
     np.testing.assert_allclose(expected.spread[0, 1, 0], variance, rtol=1e-4)
 
 
-@pytest.mark.parametrize("shaped", [False, True])
-def test_likelihood_is_the_gaussian_density_of_the_forecast(shaped):
-    prior, transitions = some_prior(shaped=shaped), some_transitions(1)
-    seen = jax.tree.map(lambda x: x[0], transitions)
-    expected = first_forecast(prior, seen)
-    for got, want in zip(expected, forecast(fresh(prior), seen), strict=True):
-        np.testing.assert_allclose(got, want, rtol=1e-4)
-    var = np.asarray(expected.spread)[..., None] * np.asarray(prior.noise)[:, None]
-    density = np.exp(-0.5 * np.asarray(seen.residual) ** 2 / var) / np.sqrt(2 * np.pi * var)
-    np.testing.assert_allclose(
-        log_likelihood(expected, prior.noise), np.log(density).sum(-1), rtol=1e-4
-    )
+@pytest.mark.parametrize("steps", [0, 6])
+def test_likelihood_is_that_of_regression_with_unknown_noise(steps):
+    """Student's t, against the ratio of marginal likelihoods of n + 1 and n transitions."""
+    prior, transitions = some_prior(shaped=True), some_transitions(steps + 1)
+    before, last = (jax.tree.map(lambda x, part=part: x[part], transitions)
+                    for part in (slice(steps), steps))  # fmt: skip
+    state = learn_all(fresh(prior), before)
+    found = log_likelihood(forecast(state, last), state, prior)
+    f, r, n = (np.asarray(x, np.float64) for x in transitions)
+    for env, member, head in np.ndindex(ENVS, MEMBERS, HEADS):
+        rows = f[:, env, member]
+        kernel = rows @ prior_covariance(prior, member) @ rows.T + np.diag(n[:, env, member, 0])
+        expected = 0.0
+        for o in range(OBS):
+            scale = NOISE_DOF * float(prior.noise[member, o])
+            errors = r[:, env, member, head, o]
+            whole, part = (
+                stats.multivariate_t(
+                    shape=scale / NOISE_DOF * kernel[:k, :k], df=NOISE_DOF
+                ).logpdf(errors[:k]) if k else 0.0
+                for k in (steps + 1, steps)
+            )  # fmt: skip
+            expected += whole - part
+        assert found[env, member, head] == pytest.approx(expected, rel=1e-3, abs=1e-2)
+
+
+def test_what_cannot_be_learned_from_counts_for_nothing():
+    prior, transitions = some_prior(), some_transitions(3)
+    state = learn_all(fresh(prior), transitions)
+    nothing = Observed(*(jnp.zeros_like(x[0]) for x in transitions[:2]), transitions.noise[0])
+    after = update(state, nothing, forecast(state, nothing))
+    for x, y in zip(state, after, strict=True):
+        np.testing.assert_array_equal(x, y)
 
 
 # With an agent. One wrong head, whose gain the episode teaches: the toy model is linear, so its

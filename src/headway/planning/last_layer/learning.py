@@ -13,7 +13,6 @@ from headway.planning.last_layer.regression import (
     Observed,
     Prior,
     Seen,
-    first_forecast,
     forecast,
     forget,
     log_likelihood,
@@ -116,12 +115,15 @@ def teach(
     if agent.planner.forgetting:
         layer = forget(layer, prior, agent.planner.forgetting)
     expected = forecast(layer, observed)
-    likelihood = log_likelihood(expected, prior.noise)
+    happened = observed.learned_from[..., None]
+    likelihood = happened * log_likelihood(expected, layer, prior)
     if suspicion is not None:
-        suspicion = suspicion + surprise(prior, observed, likelihood)
+        anew = untaught(agent, prior, len(suspicion))
+        first = happened * log_likelihood(forecast(anew, observed), anew, prior)
+        suspicion = suspicion + surprise(first, likelihood)
         changed = suspicion > agent.planner.change_threshold
         suspicion = jnp.where(changed, 0.0, jnp.maximum(suspicion, 0.0))
-        layer = where_env(changed, untaught(agent, prior, len(changed)), layer)
+        layer = where_env(changed, anew, layer)
         expected = forecast(layer, observed)
     return update(layer, observed, expected), suspicion, likelihood
 
@@ -138,15 +140,18 @@ def own_log_likelihood(seen: Seen) -> Float[Array, "env member head"]:
 
 
 def surprise(
-    prior: Prior, observed: Observed, likelihood: Float[Array, "env member head"]
+    anew: Float[Array, "env member head"], learned: Float[Array, "env member head"]
 ) -> Float[Array, " env"]:
     """How much better a transition is explained by an episode that has only begun.
 
     The log Bayes factor of heads that know nothing yet against those that have learned, heads
     being equally likely, on average over members.
+
+    Args:
+        anew: Log-likelihood of the transition under heads that know nothing yet.
+        learned: The same under those that have learned.
     """
-    anew = log_likelihood(first_forecast(prior, observed), prior.noise)
-    both = [jax.scipy.special.logsumexp(x, axis=-1) for x in (anew, likelihood)]
+    both = [jax.scipy.special.logsumexp(x, axis=-1) for x in (anew, learned)]
     return (both[0] - both[1]).mean(-1)
 
 

@@ -34,6 +34,8 @@ MAX_FEATURES = 1e8
 """Squared norm of the features; heads do not learn from larger ones."""
 MAX_LOG_NOISE = 7.0
 """Largest logarithm of the relative noise, either way."""
+NOISE_DOF = 1.0
+"""Transitions that the training data's noise variance is worth in an episode."""
 TINY = 1e-12
 
 
@@ -152,6 +154,11 @@ class Observed(NamedTuple):
     noise: Float[Array, "env member group"]
     """Relative variance n of the noise: one for all heads, or one for each."""
 
+    @property
+    def learned_from(self) -> Float[Array, "env member"]:
+        """1 where there is something to learn, else 0: the last feature of any transition is 1."""
+        return self.features[..., -1]
+
     @classmethod
     def of(
         cls,
@@ -190,6 +197,10 @@ class LastLayer(NamedTuple):
     what belongs to the last feature, the 1, to their biases."""
     root: Float[Array, "env member group feature feature"]
     """Square root S of the posterior covariance in units of the noise variance, P = S Sᵀ."""
+    squares: Float[Array, "env member head obs"]
+    """Sum of the squared errors of what was foreseen, each over its spread."""
+    count: Float[Array, "env member"]
+    """Transitions that were learned from."""
 
     @classmethod
     def of_prior(
@@ -208,7 +219,14 @@ class LastLayer(NamedTuple):
         return cls(
             jnp.zeros((num_envs, prior.members, heads, features, obs_size)),
             jnp.broadcast_to(start, (num_envs, prior.members, groups, features, features)),
+            jnp.zeros((num_envs, prior.members, heads, obs_size)),
+            jnp.zeros((num_envs, prior.members)),
         )
+
+    def noise(self, prior: Prior) -> Float[Array, "env member head obs"]:
+        """Variance of the noise in this episode: the prior's, corrected by the errors so far."""
+        total = NOISE_DOF * prior.noise[:, None, :] + self.squares
+        return total / (NOISE_DOF + self.count)[..., None, None]
 
 
 class Forecast(NamedTuple):
@@ -236,14 +254,6 @@ def forecast(state: LastLayer, seen: Observed) -> Forecast:
     return Forecast(seen.residual - foresee(state, seen.features), projected, spread)
 
 
-def first_forecast(prior: Prior, seen: Observed) -> Forecast:
-    """The forecast of heads that have learned nothing yet."""
-    root = prior.root(seen.features.shape[-1])
-    projected = jnp.einsum("mij,emi->emj", root, seen.features)[..., None, :]
-    spread = seen.noise + jnp.square(projected).sum(-1)
-    return Forecast(seen.residual, projected, spread)
-
-
 def update(state: LastLayer, seen: Observed, expected: Forecast) -> LastLayer:
     """Learn from one transition per environment (Potter's square-root filter).
 
@@ -255,7 +265,9 @@ def update(state: LastLayer, seen: Observed, expected: Forecast) -> LastLayer:
     weight = state.weight + gain[..., :, None] * innovation[..., None, :]
     share = 1.0 / (1.0 + jnp.sqrt(seen.noise / spread))
     lost = share[..., None, None] * gain[..., :, None] * projected[..., None, :]
-    return LastLayer(weight, state.root - lost)
+    learned = seen.learned_from
+    squares = jnp.square(innovation) / spread[..., None] * learned[..., None, None]
+    return LastLayer(weight, state.root - lost, state.squares + squares, state.count + learned)
 
 
 def forget(state: LastLayer, prior: Prior, share: float) -> LastLayer:
@@ -273,13 +285,27 @@ def forget(state: LastLayer, prior: Prior, share: float) -> LastLayer:
     size = relative.shape[-1]
     mixed = (1.0 - share) * relative @ relative.mT + share * jnp.eye(size)
     root = prior.root(size)[:, None] @ jnp.linalg.cholesky(mixed)
-    return LastLayer((1.0 - share) ** 0.5 * state.weight, root)
+    kept = 1.0 - share
+    return LastLayer(kept**0.5 * state.weight, root, kept * state.squares, kept * state.count)
 
 
 def log_likelihood(
-    expected: Forecast, noise: Float[Array, "member obs"]
+    expected: Forecast, state: LastLayer, prior: Prior
 ) -> Float[Array, "env member head"]:
-    """Log-density of the transition under each head's forecast, summed over dimensions."""
-    var = jnp.maximum(expected.spread[..., None] * noise[:, None, :], TINY)
-    terms = jnp.square(expected.innovation) / var + jnp.log(2.0 * jnp.pi * var)
-    return -0.5 * terms.sum(-1)
+    """Log-density of the transition under each head's forecast, summed over dimensions.
+
+    How large the noise is in this episode is not known either: with an inverse-gamma prior, worth
+    `NOISE_DOF` transitions, what is foreseen follows Student's t-distribution (Bishop, 2006,
+    section 2.3.7). So heads that are wrong throughout an episode are not surprised by each error.
+
+    Args:
+        expected: What was foreseen, and how it differs.
+        state: What was known before the transition.
+        prior: Where the episode began.
+    """
+    dof = (NOISE_DOF + state.count)[..., None, None]
+    var = jnp.maximum(expected.spread[..., None] * state.noise(prior), TINY)
+    tail = jnp.log1p(jnp.square(expected.innovation) / (dof * var))
+    gamma = jax.scipy.special.gammaln
+    scale = gamma(0.5 * (dof + 1.0)) - gamma(0.5 * dof) - 0.5 * jnp.log(jnp.pi * dof * var)
+    return (scale - 0.5 * (dof + 1.0) * tail).sum(-1)
