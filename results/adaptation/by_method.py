@@ -41,15 +41,22 @@ def order(scores: Scores) -> list[str]:
     return sorted(several, key=lambda name: -max(np.mean(v) for v in scores[name].values()))
 
 
-def draw(axes: Axes, scores: Scores, methods: list[str]) -> None:
+def colors_of(scores: Scores) -> dict[str, str]:
+    """The same color for an arm in all methods."""
+    arms = dict.fromkeys(arm for of_method in scores.values() for arm in of_method)
+    return dict(zip(arms, COLORS, strict=False))
+
+
+def draw(axes: Axes, scores: Scores, methods: list[str], colors: dict[str, str]) -> None:
     """A row per method, with an arm above the other; a dot per run, a bar at each arm's mean."""
     for row, method in enumerate(methods):
-        arms = list(scores[method].values())
+        arms = scores[method]
         places = row + 0.2 * (np.arange(len(arms)) - (len(arms) - 1) / 2)
-        axes.plot([np.mean(values) for values in arms], places, color=style.THREAD, lw=3, zorder=1)
-        for values, y, color in zip(arms, places, COLORS, strict=False):
-            axes.plot(values, [y] * len(values), "o", color=color, ms=4, alpha=0.6)
-            axes.plot(np.mean(values), y, "|", color=color, ms=11, mew=2.5)
+        means = [np.mean(values) for values in arms.values()]
+        axes.plot(means, places, color=style.THREAD, lw=3, zorder=1)
+        for (arm, values), y in zip(arms.items(), places, strict=True):
+            axes.plot(values, [y] * len(values), "o", color=colors[arm], ms=4, alpha=0.6)
+            axes.plot(np.mean(values), y, "|", color=colors[arm], ms=11, mew=2.5)
     axes.set_yticks(range(len(methods)), methods)
     axes.set_ylim(len(methods) - 0.5, -0.5)
     axes.grid(visible=True, axis="x")
@@ -58,7 +65,7 @@ def draw(axes: Axes, scores: Scores, methods: list[str]) -> None:
 
 def save_figure(training: Scores, unseen: Scores, path: Path, source: str) -> None:
     """Training physics on the left, unseen ones on the right."""
-    methods = order(unseen)
+    methods, colors = order(unseen), colors_of(unseen)
     caption = (
         f"A dot is one run (mean over physics), a bar the mean over runs; from {source}. Score: 0"
         " is random, 1 the planner on the true dynamics. Same trained models, same test"
@@ -69,12 +76,11 @@ def save_figure(training: Scores, unseen: Scores, path: Path, source: str) -> No
     with style.figure(path, title=title, caption=caption, size=size) as figure:
         left, right = figure.subplots(1, 2, sharex=True, sharey=True)
         for axes, scores, name in ((left, training, "training"), (right, unseen, "unseen")):
-            draw(axes, scores, methods)
+            draw(axes, scores, methods, colors)
             style.label_axis(axes, f"score on {name} physics", "")
-        arms = dict.fromkeys(arm for method in methods for arm in unseen[method])
         handles = [
             Line2D([], [], color=color, marker="o", linestyle="", label=label(arm))
-            for arm, color in zip(arms, COLORS, strict=False)
+            for arm, color in colors.items()
         ]
         style.legend(figure, handles)
 

@@ -45,6 +45,8 @@ ARMS = {
         "last-layer, forgetting 0.05",
         "evidence",
         "last-layer, evidence",
+        "likelihood",
+        "likelihood, change detection",
     )
 }
 """Settings that the run is tested with, by name."""

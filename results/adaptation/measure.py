@@ -28,27 +28,29 @@ COLUMNS = (
     "score", "return_mean", "return_std", "seconds_per_step",
 )  # fmt: skip
 LAST_LAYER = {"planner.adaptation": "last-layer"}
-FORESIGHT = LAST_LAYER | {"planner.adaptation_criterion": "foresight"}
+LIKELIHOOD = LAST_LAYER | {"planner.adaptation_criterion": "likelihood"}
+OPTIONS: dict[str, dict[str, Any]] = {
+    "noise of the heads": {"planner.adaptation_noise": "heads"},
+    "prior of the runner-up": {"planner.adaptation_prior": "runner-up"},
+    "corrected selection": {"planner.selection_error": "corrected"},
+    "evidence": {"planner.head_selection": "evidence"},
+    "evidence-sampled": {"planner.head_selection": "evidence-sampled"},
+    "variance": {"planner.adaptation_variance": True},
+    "variance, risk 1": {"planner.adaptation_variance": True, "planner.risk_aversion": 1.0},
+    "risk 1": {"planner.risk_aversion": 1.0},
+    "forgetting 0.05": {"planner.forgetting": 0.05},
+    "forgetting 0.001": {"planner.forgetting": 0.001},
+    "change detection": {"planner.change_threshold": 20.0},
+}
+FROZEN = ("evidence", "risk 1")
+"""Options that heads which do not learn have too."""
 ARMS: dict[str, dict[str, Any]] = {
     "none": {},
+    **{name: OPTIONS[name] for name in FROZEN},
     "last-layer": LAST_LAYER,
-    "last-layer, noise of the heads": LAST_LAYER | {"planner.adaptation_noise": "heads"},
-    "last-layer, prior of the runner-up": LAST_LAYER | {"planner.adaptation_prior": "runner-up"},
-    "last-layer, corrected selection": LAST_LAYER | {"planner.selection_error": "corrected"},
-    "evidence": {"planner.head_selection": "evidence"},
-    "last-layer, evidence": LAST_LAYER | {"planner.head_selection": "evidence"},
-    "last-layer, evidence-sampled": LAST_LAYER | {"planner.head_selection": "evidence-sampled"},
-    "last-layer, variance": LAST_LAYER | {"planner.adaptation_variance": True},
-    "last-layer, variance, risk 1": LAST_LAYER
-    | {"planner.adaptation_variance": True, "planner.risk_aversion": 1.0},
-    "last-layer, risk 1": LAST_LAYER | {"planner.risk_aversion": 1.0},
-    "risk 1": {"planner.risk_aversion": 1.0},
-    "last-layer, forgetting 0.05": LAST_LAYER | {"planner.forgetting": 0.05},
-    "last-layer, forgetting 0.001": LAST_LAYER | {"planner.forgetting": 0.001},
-    "last-layer, change detection": LAST_LAYER | {"planner.change_threshold": 20.0},
-    "foresight": FORESIGHT,
-    "foresight, change detection": FORESIGHT | {"planner.change_threshold": 20.0},
-    "foresight, forgetting 0.05": FORESIGHT | {"planner.forgetting": 0.05},
+    **{f"last-layer, {name}": LAST_LAYER | option for name, option in OPTIONS.items()},
+    "likelihood": LIKELIHOOD,
+    **{f"likelihood, {name}": LIKELIHOOD | option for name, option in OPTIONS.items()},
 }
 """Settings that the run is tested with, by name."""
 

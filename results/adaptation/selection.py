@@ -25,16 +25,19 @@ COLUMNS = (
     "run", "env", "method", "seed", "rule", "group", "chosen_error", "best_error",
     "average_error", "wrong", "settling_steps", "settled",
 )  # fmt: skip
-DETECTING = ARMS["last-layer, change detection"]
 RULES: dict[str, dict[str, Any]] = {
     "last 10": {},
     "last 1": {"planner.selection_length": 1},
     "evidence": {"planner.head_selection": "evidence"},
     "random": {"planner.head_selection": "random"},
-    "last layer; frozen heads, last 10": DETECTING,
-    "last layer; corrected heads, last 10": DETECTING | {"planner.selection_error": "corrected"},
-    "last layer; evidence": DETECTING | {"planner.head_selection": "evidence"},
 }
+for arm, heads in (("last-layer", "last layer"), ("likelihood", "likelihood")):
+    detecting = ARMS[f"{arm}, change detection"]
+    RULES |= {
+        f"{heads}; frozen heads, last 10": detecting,
+        f"{heads}; corrected heads, last 10": detecting | {"planner.selection_error": "corrected"},
+        f"{heads}; evidence": detecting | {"planner.head_selection": "evidence"},
+    }
 """Settings of the planner, by name."""
 
 

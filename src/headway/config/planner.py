@@ -78,13 +78,13 @@ class PlannerConfig:
     """Noise of the transitions that are learned from: the same for all, or in proportion to what
     each head's own variance says (last-layer)."""
     adaptation_prior: Literal["owner", "runner-up"] = "owner"
-    """Which head's residuals on the training episodes the prior is fitted to: those of the head
-    that explains an episode best, or second best, as if it were of unseen physics (last-layer);
-    foresight looks at both."""
-    adaptation_criterion: Literal["likelihood", "foresight"] = "likelihood"
-    """What the prior is chosen by: the likelihood of the training episodes, or how well the rest
-    of an episode is foreseen, one horizon ahead, after learning from its beginning
-    (last-layer)."""
+    """Which head's residuals on the training episodes are made most likely: those of the head
+    that explains an episode best, or second best, as if it were of unseen physics (last-layer).
+    With foresight that decides the noise alone; the rest is chosen by both."""
+    adaptation_criterion: Literal["foresight", "likelihood"] = "foresight"
+    """What the prior is chosen by: how well the rest of a training episode is foreseen, one
+    horizon ahead, after learning from its beginning; or the likelihood of whole episodes, all
+    weights being equally uncertain (last-layer)."""
     adaptation_variance: bool = False
     """Whether the uncertainty of what was learned adds to the noise of imagined steps (last-layer);
     costs one more hidden layer."""

@@ -90,7 +90,8 @@ class MultiHeaded(Learner):
         self, learned: Learned, trajectories: Sequence[Trajectory]
     ) -> AdaptationLoss:
         """The loss after learning, under the prior that the model of the moment asks for."""
-        prior = self._prior(learned, trajectories, PlannerConfig())
+        likely = PlannerConfig(adaptation_criterion="likelihood")
+        prior = self._prior(learned, trajectories, likely)
         return AdaptationLoss(self.task, self.config.model.history_length, prior.ratio)
 
     def agent(
