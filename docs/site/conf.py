@@ -2,10 +2,14 @@
 
 import importlib.metadata
 import sys
+import typing
 from pathlib import Path
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
+
+# jaxtyping and Equinox look for this, and show `Float[Array, "env obs"]` as it is written.
+typing.GENERATING_DOCUMENTATION = "headway"  # pyright: ignore
 
 project = "Headway"
 author = "The Headway developers"

@@ -52,7 +52,7 @@ def options(lines: list[str]) -> Iterator[tuple[str, str]]:
 def as_literals(text: str) -> str:
     """Help says code in Markdown's single backticks, or as it is typed."""
     text = re.sub(r"(?<!`)`([^`]+)`(?!`)", r"``\1``", text)
-    return re.sub(r"(?<![`\w-])(--[a-z][\w.-]*)", r"``\1``", text)
+    return re.sub(r"(?<![`\w-])(--[a-z][\w.-]*\w)", r"``\1``", text)
 
 
 def entries(command: str) -> str:

@@ -10,25 +10,27 @@ SECTIONS = "model|fitting|planner|collection|evaluation"
 SETTING = re.compile(rf"(?:--)?((?:{SECTIONS})\.[a-z_-]+)(?:[= ].*)?")
 LINKS = nodes.title | nodes.reference | addnodes.pending_xref  # need none, or are one
 NAME = re.compile(r"(headway\.[\w.]+)(?:\(.*\))?")
+COMMAND = re.compile(r"headway ([a-z-]+)(?: .*)?")
 
 
-def named(code: str) -> str | None:
-    """The setting or public name that a piece of code in a text is about."""
-    setting, name = SETTING.fullmatch(code), NAME.fullmatch(code)
-    if setting:
-        return setting[1].replace("-", "_")
-    return name[1] if name else None
+def goal(code: str) -> dict[str, str] | None:
+    """Where a piece of code in a text leads: to a setting, a public name, or a command."""
+    if setting := SETTING.fullmatch(code):
+        return {"refdomain": "py", "reftype": "obj", "reftarget": setting[1].replace("-", "_")}
+    if name := NAME.fullmatch(code):
+        return {"refdomain": "py", "reftype": "obj", "reftarget": name[1]}
+    if command := COMMAND.fullmatch(code):
+        return {"refdomain": "std", "reftype": "ref", "reftarget": f"command-{command[1]}"}
+    return None
 
 
 def link_mentions(app, document: nodes.document) -> None:
-    """Link `planner.horizon`, `--planner.horizon 20` and `headway.train(...)` in the guides."""
+    """Link `planner.horizon`, `headway.train(...)` and `headway train ENV` in the guides."""
     for code in list(document.findall(nodes.literal)):
-        target = named(code.astext())
-        if target is None or isinstance(code.parent, LINKS):
+        where = goal(code.astext())
+        if where is None or isinstance(code.parent, LINKS):
             continue
-        link = addnodes.pending_xref(
-            "", refdomain="py", reftype="obj", reftarget=target, refdoc=app.env.docname
-        )
+        link = addnodes.pending_xref("", refdoc=app.env.docname, refexplicit=True, **where)
         code.replace_self(link)
         link += code
 
@@ -53,13 +55,7 @@ def find_name(app, env, node: addnodes.pending_xref, content: nodes.Node) -> nod
     return None
 
 
-def shorten_defaults(app, what, name, thing, options, signature, returned) -> tuple | None:
-    """Say less of defaults that a function makes."""
-    return (signature.replace("<factory>", "..."), returned) if signature else None
-
-
 def setup(app) -> None:
     """Connect to Sphinx."""
     app.connect("doctree-read", link_mentions)
     app.connect("missing-reference", find_name)
-    app.connect("autodoc-process-signature", shorten_defaults)

@@ -25,7 +25,7 @@ def entries(section: str) -> str:
     for field in dataclasses.fields(config):
         text = "\n".join(texts[name, field.name])
         parts.append(
-            f".. py:attribute:: {section}.{field.name}\n"
+            f".. py:attribute:: {field.name}\n"
             f"   :type: {stringify_annotation(hints[field.name], 'smart')}\n"
             f"   :value: {field.default!r}\n\n{indent(text, '   ')}"
         )
