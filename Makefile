@@ -25,7 +25,7 @@ demo: $(VENV)/main.stamp ## Train and evaluate T-MCL on Pendulum, in minutes
 test: $(VENV)/test.stamp ## Run the tests; JOBS=4 runs four at a time
 	@$(BIN)/python -m pytest -n $(JOBS) -m "not slow"
 
-test-slow: $(VENV)/test.stamp ## Run the tests that take minutes each
+test-slow: $(VENV)/test.stamp $(VENV)/docs.stamp ## Run the tests that take minutes each
 	@$(BIN)/python -m pytest -m slow
 
 lint: $(VENV)/test.stamp $(VENV)/lint.stamp ## Check style, types and import rules

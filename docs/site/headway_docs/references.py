@@ -5,6 +5,7 @@ from collections.abc import Iterator
 
 from docutils import nodes
 from sphinx import addnodes
+from sphinx.util.nodes import make_refnode
 
 SECTIONS = "model|fitting|planner|collection|evaluation"
 SETTING = re.compile(rf"(?:--)?((?:{SECTIONS})\.[a-z_-]+)(?:[= ].*)?")
@@ -20,7 +21,7 @@ def goal(code: str) -> dict[str, str] | None:
     if name := NAME.fullmatch(code):
         return {"refdomain": "py", "reftype": "obj", "reftarget": name[1]}
     if command := COMMAND.fullmatch(code):
-        return {"refdomain": "std", "reftype": "ref", "reftarget": f"command-{command[1]}"}
+        return {"refdomain": "", "reftype": "command", "reftarget": f"command-{command[1]}"}
     return None
 
 
@@ -30,7 +31,7 @@ def link_mentions(app, document: nodes.document) -> None:
         where = goal(code.astext())
         if where is None or isinstance(code.parent, LINKS):
             continue
-        link = addnodes.pending_xref("", refdoc=app.env.docname, refexplicit=True, **where)
+        link = addnodes.pending_xref("", refdoc=app.env.docname, **where)
         code.replace_self(link)
         link += code
 
@@ -44,7 +45,10 @@ def places(target: str, known: dict) -> Iterator[str]:
 
 
 def find_name(app, env, node: addnodes.pending_xref, content: nodes.Node) -> nodes.Node | None:
-    """Resolve a name that was written without its module, or with the one it is defined in."""
+    """Resolve a command, or a name without its module or with the one that it is defined in."""
+    if node["reftype"] == "command":
+        page, anchor = env.domains["std"].anonlabels.get(node["reftarget"], (None, None))
+        return page and make_refnode(app.builder, node["refdoc"], page, anchor, content)
     if node.get("refdomain") != "py":
         return None
     domain = env.domains["py"]
