@@ -6,12 +6,14 @@ import shutil
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import headway
 from headway import settings
 from headway.cli import main
 from headway.errors import RunError
+from headway.experiment.loading import load_learned
 from headway.storage import config_file
 from headway.storage.records import read_csv
 from headway.storage.run_dir import RunDir
@@ -159,3 +161,29 @@ def test_what_was_kept_can_be_read():
         manifest = run.manifest()
         assert manifest is not None
         manifest.check(path, ["config.json", *TABLES])
+
+
+def forward_heads(path):
+    """Mean weights of the forward network [member, head, in, out] in the last checkpoint."""
+    run = RunDir(path)
+    return load_learned(run, run.config()).fit.model.forward_net.mean_heads.weight
+
+
+def test_pruning_leaves_the_heads_that_own_something(run_dir, run_script, tmp_path, capsys):
+    run_script("prune.py", run_dir, tmp_path / "all", "--min-share", 0)
+    np.testing.assert_array_equal(forward_heads(tmp_path / "all"), forward_heads(run_dir))
+    run_script("prune.py", run_dir, tmp_path / "most", "--min-share", 1.1)
+    assert "heads left: 1 1" in capsys.readouterr().out
+    for before, after in zip(forward_heads(run_dir), forward_heads(tmp_path / "most"), strict=True):
+        assert (np.asarray(after) == np.asarray(after)[:1]).all()
+        assert any((one == after[0]).all() for one in before)
+    headway.evaluate(tmp_path / "most", num_episodes=1, groups=["low"])
+
+
+@pytest.mark.usefixtures("run_script")
+def test_a_head_that_owns_one_physics_stays():
+    replacements = runpy.run_path(str(SCRIPTS / "prune.py"))["replacements"]
+    owned = np.array([[[0.7, 0.95], [0.2, 0.0], [0.1, 0.05]]])  # one member, heads by physics
+    assert replacements(owned, 0.2).tolist() == [[0, 1, 0]]
+    assert replacements(owned, 0.1).tolist() == [[0, 1, 2]]
+    assert replacements(owned, 0.3).tolist() == [[0, 0, 0]]

@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 
 from headway.data import Trajectory
 from headway.experiment.loading import load_learned, load_task
-from headway.planning.last_layer.prior import MIN_NOISE, Evidence
+from headway.planning.last_layer.evidence import MIN_NOISE, Evidence
 from headway.storage.records import write_csv
 from headway.storage.run_dir import RunDir
 

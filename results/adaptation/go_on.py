@@ -9,6 +9,7 @@ networks are those of `headway train ... --fitting.adaptation-epochs 10`, to the
 
 import argparse
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 from headway.config import Config
@@ -53,12 +54,13 @@ def go_on(old: RunDir, config: Config) -> tuple[Learned, EpochStats]:
     return Learned(state, fit.statistics), stats
 
 
-def finish(old: RunDir, new: RunDir, learned: Learned, stats: EpochStats) -> None:
+def finish(
+    old: RunDir, new: RunDir, learned: Learned, losses: Mapping[str, float] | None = None
+) -> None:
     """Write the last iteration of the new run, which was not tested."""
     rows = old.metrics()
     last = len(rows) - 1
-    losses = {"loss": float(stats.loss), "forward_loss": float(stats.forward_loss)}
-    fitting = {**rows[last]["fitting"], **losses}
+    fitting = {**rows[last]["fitting"], **(losses or {})}
     arrays.save_tree(new.checkpoint(last), learned)
     new.append_evaluation([])
     new.append_assignments([])
@@ -78,7 +80,8 @@ def main() -> None:
     config = override(old.config(), {"fitting.adaptation_epochs": asked.epochs})
     copy_but_last_fit(old, asked.new, config)
     learned, stats = go_on(old, config)
-    finish(old, RunDir(asked.new), learned, stats)
+    losses = {"loss": float(stats.loss), "forward_loss": float(stats.forward_loss)}
+    finish(old, RunDir(asked.new), learned, losses)
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ COLUMNS = (
     "score", "return_mean", "return_std", "seconds_per_step",
 )  # fmt: skip
 LAST_LAYER = {"planner.adaptation": "last-layer"}
+FORESIGHT = LAST_LAYER | {"planner.adaptation_criterion": "foresight"}
 ARMS: dict[str, dict[str, Any]] = {
     "none": {},
     "last-layer": LAST_LAYER,
@@ -45,6 +46,9 @@ ARMS: dict[str, dict[str, Any]] = {
     "last-layer, forgetting 0.05": LAST_LAYER | {"planner.forgetting": 0.05},
     "last-layer, forgetting 0.001": LAST_LAYER | {"planner.forgetting": 0.001},
     "last-layer, change detection": LAST_LAYER | {"planner.change_threshold": 20.0},
+    "foresight": FORESIGHT,
+    "foresight, change detection": FORESIGHT | {"planner.change_threshold": 20.0},
+    "foresight, forgetting 0.05": FORESIGHT | {"planner.forgetting": 0.05},
 }
 """Settings that the run is tested with, by name."""
 

@@ -19,6 +19,7 @@ from headway.planning.last_layer.regression import (
     LastLayer,
     Observed,
     Prior,
+    Shape,
     first_forecast,
     forecast,
     forget,
@@ -39,9 +40,23 @@ LAST_LAYER = PlannerConfig(
 )
 
 
-def some_prior(ratio=0.5):
+def some_prior(ratio=0.5, *, shaped=False):
+    """A prior with other numbers for each member; shaped, its weights are correlated too."""
+    shape, rng = None, np.random.default_rng(7)
+    if shaped:
+        turn, _ = np.linalg.qr(rng.normal(size=(MEMBERS, FEATURES, FEATURES)))
+        roots = turn * np.geomspace(0.1, 2.0, FEATURES)
+        shape = Shape(*(jnp.asarray(x, jnp.float32) for x in (roots, np.linalg.inv(roots))))
     ratios = jnp.asarray([ratio, 2.0 * ratio])
-    return Prior(ratios, jnp.asarray([[0.1, 0.2], [0.3, 0.4]]), jnp.zeros(MEMBERS))
+    return Prior(ratios, jnp.asarray([[0.1, 0.2], [0.3, 0.4]]), jnp.zeros(MEMBERS), shape)
+
+
+def prior_covariance(prior, member):
+    """Of one member, over the noise variance, in float64."""
+    root = np.eye(FEATURES)
+    if prior.shape is not None:
+        root = np.asarray(prior.shape.root[member], np.float64)
+    return float(prior.ratio[member]) * root @ root.T
 
 
 def some_transitions(steps, groups=1, seed=0):
@@ -73,13 +88,14 @@ def batch_posterior(prior, transitions, env, member, head, group):
     """Mean and covariance (over the noise variance) of Bayesian linear regression, float64."""
     f, r, n = (np.asarray(x, np.float64)[:, env, member] for x in transitions)
     whitened = f / n[:, group, None]
-    precision = np.eye(f.shape[1]) / float(prior.ratio[member]) + whitened.T @ f
+    precision = np.linalg.inv(prior_covariance(prior, member)) + whitened.T @ f
     return np.linalg.solve(precision, whitened.T @ r[:, head]), np.linalg.inv(precision)
 
 
+@pytest.mark.parametrize("shaped", [False, True])
 @pytest.mark.parametrize("groups", [1, HEADS])
-def test_a_thousand_updates_equal_batch_regression_in_float64(groups):
-    prior, transitions = some_prior(), some_transitions(1000, groups)
+def test_a_thousand_updates_equal_batch_regression_in_float64(groups, shaped):
+    prior, transitions = some_prior(shaped=shaped), some_transitions(1000, groups)
     state = learn_all(fresh(prior, groups), transitions)
     for env, member, head in np.ndindex(ENVS, MEMBERS, HEADS):
         group = min(head, groups - 1)
@@ -89,8 +105,9 @@ def test_a_thousand_updates_equal_batch_regression_in_float64(groups):
         np.testing.assert_allclose(root @ root.T, covariance, atol=1e-5)
 
 
-def test_a_prior_of_zero_never_learns():
-    prior = some_prior(0.0)
+@pytest.mark.parametrize("shaped", [False, True])
+def test_a_prior_of_zero_never_learns(shaped):
+    prior = some_prior(0.0, shaped=shaped)
     state = learn_all(fresh(prior), some_transitions(50))
     assert not np.asarray(state.weight).any()
     assert not np.asarray(state.root).any()
@@ -99,8 +116,9 @@ def test_a_prior_of_zero_never_learns():
     assert np.isfinite(forgotten.root).all()
 
 
-def test_a_hundred_thousand_updates_stay_finite_and_within_the_prior():
-    prior = some_prior(1e5)
+@pytest.mark.parametrize("shaped", [False, True])
+def test_a_hundred_thousand_updates_stay_finite_and_within_the_prior(shaped):
+    prior = some_prior(1e5, shaped=shaped)
     transitions = some_transitions(1000)
     transitions = transitions._replace(features=30.0 * transitions.features)
 
@@ -110,7 +128,7 @@ def test_a_hundred_thousand_updates_stay_finite_and_within_the_prior():
     state = jax.jit(lambda state: jax.lax.fori_loop(0, 100, again, state))(fresh(prior))
     assert np.isfinite(state.weight).all()
     covariance = np.asarray(state.root @ state.root.mT)
-    largest = np.asarray(prior.ratio)[:, None]
+    largest = [np.diag(prior_covariance(prior, member)) for member in range(MEMBERS)]
     diagonal = np.diagonal(covariance, axis1=-2, axis2=-1)[:, :, 0]
     assert (diagonal > 0).all()
     assert (diagonal <= largest).all()
@@ -118,9 +136,10 @@ def test_a_hundred_thousand_updates_stay_finite_and_within_the_prior():
     assert np.square(residual).mean() < 0.1
 
 
-def test_forgetting_is_the_drift_whose_stationary_distribution_is_the_prior():
+@pytest.mark.parametrize("shaped", [False, True])
+def test_forgetting_is_the_drift_whose_stationary_distribution_is_the_prior(shaped):
     """Against Gaussian-process regression with weights of correlation (1 - share)^(|t - s| / 2)."""
-    prior, share, steps = some_prior(), 0.2, 12
+    prior, share, steps = some_prior(shaped=shaped), 0.2, 12
     transitions = some_transitions(steps)
     state = fresh(prior)
     for step in range(steps):
@@ -130,7 +149,7 @@ def test_forgetting_is_the_drift_whose_stationary_distribution_is_the_prior():
         state = update(state, seen, expected)
     f, r, _ = (np.asarray(x, np.float64)[:, 0, 1] for x in transitions)
     lag = np.abs(np.subtract.outer(range(steps), range(steps)))
-    kernel = float(prior.ratio[1]) * (f @ f.T) * (1 - share) ** (lag / 2)
+    kernel = f @ prior_covariance(prior, 1) @ f.T * (1 - share) ** (lag / 2)
     past = np.linalg.solve(kernel[:-1, :-1] + np.eye(steps - 1), r[:-1, 2])
     mean = kernel[-1, :-1] @ past
     np.testing.assert_allclose(expected.innovation[0, 1, 2], r[-1, 2] - mean, atol=1e-4)
@@ -139,8 +158,9 @@ def test_forgetting_is_the_drift_whose_stationary_distribution_is_the_prior():
     np.testing.assert_allclose(expected.spread[0, 1, 0], variance, rtol=1e-4)
 
 
-def test_likelihood_is_the_gaussian_density_of_the_forecast():
-    prior, transitions = some_prior(), some_transitions(1)
+@pytest.mark.parametrize("shaped", [False, True])
+def test_likelihood_is_the_gaussian_density_of_the_forecast(shaped):
+    prior, transitions = some_prior(shaped=shaped), some_transitions(1)
     seen = jax.tree.map(lambda x: x[0], transitions)
     expected = first_forecast(prior, seen)
     for got, want in zip(expected, forecast(fresh(prior), seen), strict=True):

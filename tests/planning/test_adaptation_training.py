@@ -13,7 +13,7 @@ from headway.config import FittingConfig, ModelConfig
 from headway.data import Trajectory
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitSetup, fit_epoch, make_data
-from headway.planning.last_layer.prior import MIN_NOISE
+from headway.planning.last_layer.evidence import MIN_NOISE
 from headway.planning.last_layer.regression import (
     LastLayer,
     Observed,

@@ -79,7 +79,12 @@ class PlannerConfig:
     each head's own variance says (last-layer)."""
     adaptation_prior: Literal["owner", "runner-up"] = "owner"
     """Which head's residuals on the training episodes the prior is fitted to: those of the head
-    that explains an episode best, or second best, as if it were of unseen physics (last-layer)."""
+    that explains an episode best, or second best, as if it were of unseen physics (last-layer);
+    foresight looks at both."""
+    adaptation_criterion: Literal["likelihood", "foresight"] = "likelihood"
+    """What the prior is chosen by: the likelihood of the training episodes, or how well the rest
+    of an episode is foreseen, one horizon ahead, after learning from its beginning
+    (last-layer)."""
     adaptation_variance: bool = False
     """Whether the uncertainty of what was learned adds to the noise of imagined steps (last-layer);
     costs one more hidden layer."""
@@ -116,6 +121,7 @@ class PlannerConfig:
         problems.one_of("adaptation", typing.get_args(Adaptation))
         problems.one_of("adaptation_noise", ("constant", "heads"))
         problems.one_of("adaptation_prior", ("owner", "runner-up"))
+        problems.one_of("adaptation_criterion", ("likelihood", "foresight"))
         problems.between(0.0, 0.99, "forgetting")
         problems.at_least(0, "change_threshold", "risk_aversion")
         problems.require(

@@ -146,6 +146,7 @@ _USED_WHEN: tuple[tuple[Callable[[Config], bool], tuple[str, ...]], ...] = (
         (
             "planner.adaptation_noise",
             "planner.adaptation_prior",
+            "planner.adaptation_criterion",
             "planner.adaptation_variance",
             "planner.forgetting",
             "planner.change_threshold",

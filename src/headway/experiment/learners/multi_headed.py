@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
+from headway.config import PlannerConfig
 from headway.data import Episodes, Trajectory
 from headway.experiment.blocks import Block, BlockedData, Layout, fit_blocks
 from headway.experiment.diagnostics import head_shares, prediction_error
@@ -20,6 +21,7 @@ from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import EpochStats, FitSetup, FitState, episode_losses
 from headway.planning.agent import Agent
 from headway.planning.last_layer.prior import fit_prior
+from headway.planning.last_layer.regression import Prior
 from headway.planning.last_layer.training import AdaptationLoss, for_adaptation
 
 
@@ -88,11 +90,8 @@ class MultiHeaded(Learner):
         self, learned: Learned, trajectories: Sequence[Trajectory]
     ) -> AdaptationLoss:
         """The loss after learning, under the prior that the model of the moment asks for."""
-        length = self.config.model.history_length
-        prior = fit_prior(
-            learned.fit.model, self.task, learned.statistics, trajectories, history_length=length
-        )
-        return AdaptationLoss(self.task, length, prior.ratio)
+        prior = self._prior(learned, trajectories, PlannerConfig())
+        return AdaptationLoss(self.task, self.config.model.history_length, prior.ratio)
 
     def agent(
         self,
@@ -106,16 +105,20 @@ class MultiHeaded(Learner):
         planner, history_length = self.config.planner, self.config.model.history_length
         prior = None
         if planner.adaptation != "none":
-            prior = fit_prior(
-                model,
-                self.task,
-                statistics,
-                trajectories,
-                history_length=history_length,
-                head_noise=planner.adaptation_noise == "heads",
-                rank=planner.adaptation_prior,
-            )
+            prior = self._prior(learned, trajectories, planner)
         return Agent(model, statistics, self.task, planner, history_length, prior)
+
+    def _prior(
+        self, learned: Learned, trajectories: Sequence[Trajectory], planner: PlannerConfig
+    ) -> Prior:
+        return fit_prior(
+            learned.fit.model,
+            self.task,
+            learned.statistics,
+            trajectories,
+            history_length=self.config.model.history_length,
+            planner=planner,
+        )
 
     def frozen(self, learned: Learned) -> Agent:
         """The agent whose heads stay as they were fitted."""

@@ -1,94 +1,33 @@
-"""What heads should expect to learn in an episode: empirical Bayes on the training data.
+"""What heads should expect to learn in an episode, from the training data.
 
-Every collected episode is a task of its own, in which the correction of `regression` is drawn
-from the prior. Its residuals are then jointly Gaussian, for each dimension o
-
-    r_o ~ N(0, σ_o² (N + ρ Φ Φᵀ)),
-
-with Φ the features of all transitions and N the relative noise. The prior is the (ρ, σ²) of each
-member under which the residuals of all training episodes are most likely (type-II maximum
-likelihood; MacKay, 1992). σ² has a closed form for every ρ, so only ρ is searched for.
+Each training episode is a task of its own. The prior of a correction is chosen by how well the
+rest of an episode is foreseen once its beginning was learned from (`foresight`), or by empirical
+Bayes, the likelihood of all episodes (`evidence`), all weights being equally uncertain then. The
+noise σ² is the most likely one for that prior.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import TypeVar
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
 from threadpoolctl import threadpool_limits
 
-from headway.data import Episodes, Trajectory
+from headway.config import PlannerConfig
+from headway.data import Trajectory
 from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.planning.last_layer.regression import MAX_LOG_NOISE, Prior, Seen, see_episode
+from headway.planning.last_layer import foresight
+from headway.planning.last_layer.evidence import Evidence
+from headway.planning.last_layer.regression import Prior, Shape
+from headway.planning.last_layer.residuals import Onlooker, Rank, Residuals
 from headway.tasks.base import Task
 
-RATIOS = np.geomspace(1e-7, 1e7, 281)
-"""Ratios of prior to noise variance that are tried."""
 MAX_EPISODES = 100
 """Episodes that are looked at, evenly spread over those collected; the paper's are all."""
-MIN_NOISE = 1e-10
-"""Least variance of the noise, in normalised units."""
 
-Rank = Literal["owner", "runner-up"]
-
-
-class Evidence(NamedTuple):
-    """What the likelihood of some episodes depends on, one row per episode (member fixed).
-
-    From the eigenvalues of ΦᵀN⁻¹Φ and the projections of ΦᵀN⁻¹r on its eigenvectors.
-    """
-
-    eigenvalues: Float[np.ndarray, "episode feature"]
-    projected: Float[np.ndarray, "episode feature obs"]
-    squares: Float[np.ndarray, "episode obs"]
-    """Sum of squared residuals over the relative noise."""
-    log_noise: Float[np.ndarray, " episode"]
-    """Sum of the logarithms of the relative noise."""
-    steps: Int[np.ndarray, " episode"]
-
-    @classmethod
-    def of(cls, rows: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> "Evidence":
-        """Reduce episodes to what their likelihood depends on.
-
-        Args:
-            rows: Features [time, feature], residuals [time, obs] and relative noise [time] of
-                each episode, in float64.
-        """
-        parts = []
-        for features, residual, noise in rows:
-            whitened = features / noise[:, None]
-            values, vectors = np.linalg.eigh(features.T @ whitened)
-            projected = vectors.T @ (whitened.T @ residual)
-            squares = (np.square(residual) / noise[:, None]).sum(0)
-            parts.append(
-                (np.maximum(values, 0), projected, squares, np.log(noise).sum(), len(noise))
-            )
-        return cls(*(np.stack(column) for column in zip(*parts, strict=True)))
-
-    @classmethod
-    def joined(cls, parts: Sequence["Evidence"]) -> "Evidence":
-        """The same of all their episodes."""
-        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-    def noise(self, ratio: float) -> Float[np.ndarray, " obs"]:
-        """The most likely variance of the noise under a ratio."""
-        shrunk = ratio / (1.0 + ratio * self.eigenvalues)
-        explained = (np.square(self.projected) * shrunk[..., None]).sum((0, 1))
-        return np.maximum((self.squares.sum(0) - explained) / self.steps.sum(), MIN_NOISE)
-
-    def log_likelihood(self, ratio: float) -> float:
-        """Log-density of all residuals under a ratio and its most likely noise."""
-        noise, steps = self.noise(ratio), self.steps.sum()
-        log_volume = np.log1p(ratio * self.eigenvalues).sum() + self.log_noise.sum()
-        per_dimension = steps * (np.log(2.0 * np.pi * noise) + 1.0) + log_volume
-        return float(-0.5 * per_dimension.sum())
-
-    def best_ratio(self) -> float:
-        """The ratio, among `RATIOS`, of the highest likelihood."""
-        return float(max(RATIOS, key=self.log_likelihood))
+RANKS: tuple[Rank, ...] = ("owner", "runner-up")
+References = Sequence[float | None]
+Item = TypeVar("Item")
 
 
 def fit_prior(
@@ -98,10 +37,9 @@ def fit_prior(
     trajectories: Sequence[Trajectory],
     *,
     history_length: int,
-    head_noise: bool = False,
-    rank: Rank = "owner",
+    planner: PlannerConfig,
 ) -> Prior:
-    """Choose the prior under which the training episodes are most likely.
+    """Choose the prior that suits the training episodes.
 
     Args:
         model: The dynamics model, as trained on these episodes.
@@ -109,67 +47,65 @@ def fit_prior(
         statistics: The normalisers in use.
         trajectories: Episodes under training physics; which physics is not looked at.
         history_length: Past transitions that the context is made of (K).
-        head_noise: Whether the relative noise follows the heads' own variance.
-        rank: Whose residuals: of the head that explains an episode best, or second best, as if
-            no head had been made for its physics.
+        planner: Says by what to choose (`adaptation_criterion`), whose residuals are likely
+            (`adaptation_prior`), what the noise is like, and how far plans look ahead.
     """
-    chosen = [trajectories[i] for i in _spread(len(trajectories), MAX_EPISODES)]
-    longest = max(len(t) for t in chosen)
-    members = range(model.num_members)
-
-    def looks() -> Iterator[list[_OfMember]]:
-        """One episode after the other, so that the features of no two are ever held."""
-        for trajectory in chosen:
-            episode = Episodes.pad([trajectory], 1, longest, model.sim_param_names)
-            found = _look(model, task, statistics, episode, history_length)
-            steps = slice(len(trajectory))
-            seen = jax.tree.map(lambda x, s=steps: np.asarray(x[s]), found)
-            yield [_of_member(seen, member, rank) for member in members]
-
+    onlooker = Onlooker(model, task, statistics, history_length, planner.adaptation_prior)
+    chosen = _spread(trajectories, MAX_EPISODES)
     # Small matrices, one after the other: BLAS threads only wait for each other, and for long
     # where the cores have other work too.
     with threadpool_limits(1, user_api="blas"):
-        return _most_likely(looks, len(members), head_noise=head_noise)
+        relative: References = [None] * model.num_members
+        if planner.adaptation_noise == "heads":
+            relative = _mean_logvar(map(_claims, onlooker.episodes(chosen)))
+        shape, ratio = None, None
+        if planner.adaptation_criterion == "foresight":
+            shape, ratio = _foreseen_best(onlooker, chosen, planner.horizon, relative)
+        evidence, references = _reduced(onlooker.episodes(chosen), relative, shape)
+        ratios = [of_member.best_ratio() if ratio is None else ratio for of_member in evidence]
+    noise = [of_member.noise(r) for of_member, r in zip(evidence, ratios, strict=True)]
+    columns = (jnp.asarray(np.asarray(x), jnp.float32) for x in (ratios, noise, references))
+    return Prior(*columns, shape)
 
 
-class _OfMember(NamedTuple):
-    """One episode through one head of one member."""
-
-    features: Float[np.ndarray, "time feature"]
-    residual: Float[np.ndarray, "time obs"]
-    logvar: Float[np.ndarray, " time"]
-
-
-def _of_member(seen: Seen, member: int, rank: Rank) -> _OfMember:
-    """The episode as the head of a rank sees it, by the summed squared error."""
-    residual = np.asarray(seen.residual[:, member], np.float64)
-    order = np.argsort(np.square(residual).sum((0, 2)), kind="stable")
-    head = order[min(int(rank == "runner-up"), len(order) - 1)]
-    logvar = np.zeros(len(residual))
-    if seen.logvar is not None:
-        logvar = np.asarray(seen.logvar[:, member, head], np.float64).mean(-1)
-    return _OfMember(np.asarray(seen.features[:, member], np.float64), residual[:, head], logvar)
+def _foreseen_best(
+    onlooker: Onlooker, trajectories: Sequence[Trajectory], horizon: int, references: References
+) -> tuple[Shape, float]:
+    """The spread over the features of each member and the ratio that foresee most."""
+    chosen = _spread(trajectories, foresight.MAX_EPISODES)
+    moments = [foresight.moments_of(len(t), i) for i, t in enumerate(chosen)]
+    directions = foresight.directions_of(onlooker.episodes(chosen))
+    errors = []
+    for rank in RANKS[: onlooker.model.num_heads]:
+        foreseen = onlooker._replace(rank=rank).from_moments(chosen, moments)
+        errors.append(foresight.relative_errors(foreseen, directions, horizon, references))
+    power, ratio = foresight.best(errors)
+    roots = np.stack([one.root(power) for one in directions])
+    inverses = np.stack([one.inverse(power) for one in directions])
+    return Shape(*(jnp.asarray(x, jnp.float32) for x in (roots, inverses))), ratio
 
 
-def _most_likely(
-    looks: Callable[[], Iterator[list[_OfMember]]], num_members: int, *, head_noise: bool
-) -> Prior:
-    """The prior of every member; where the noise is relative, in two looks at the episodes."""
-    used = _mean_logvar(map(_claims, looks())) if head_noise else [None] * num_members
+def _reduced(
+    episodes: Iterable[list[Residuals]], references: References, shape: Shape | None
+) -> tuple[list[Evidence], list[float]]:
+    """What each member's likelihood depends on, and what its heads claim, in one look."""
+    roots = [None] * len(references) if shape is None else np.asarray(shape.root, np.float64)
     parts, claims = [], []
-    for episode in looks():
-        parts.append([*map(_reduced, episode, used)])
+    for episode in episodes:
+        rows = [
+            (
+                one.features if root is None else one.features @ root,
+                one.residual,
+                one.relative_noise(reference),
+            )
+            for one, reference, root in zip(episode, references, roots, strict=True)
+        ]
+        parts.append([Evidence.of([row]) for row in rows])
         claims.append(_claims(episode))
-    references, priors = _mean_logvar(claims), []
-    for member in range(num_members):
-        evidence = Evidence.joined([episode[member] for episode in parts])
-        ratio = evidence.best_ratio()
-        priors.append((ratio, evidence.noise(ratio), references[member]))
-    columns = (np.stack(column) for column in zip(*priors, strict=True))
-    return Prior(*(jnp.asarray(column, jnp.float32) for column in columns))
+    return [Evidence.joined(column) for column in zip(*parts, strict=True)], _mean_logvar(claims)
 
 
-def _claims(episode: list[_OfMember]) -> list[tuple[float, int]]:
+def _claims(episode: list[Residuals]) -> list[tuple[float, int]]:
     """Sum and number of the log-variances that each member's head claims in an episode."""
     return [(one.logvar.sum(), len(one.logvar)) for one in episode]
 
@@ -180,27 +116,8 @@ def _mean_logvar(claims: Iterable[list[tuple[float, int]]]) -> list[float]:
     return (sums[:, 0] / sums[:, 1]).tolist()
 
 
-def _reduced(episode: _OfMember, reference: float | None) -> Evidence:
-    """What the likelihood of one episode depends on; its noise is relative to a reference."""
-    relative = np.zeros(len(episode.logvar))
-    if reference is not None:
-        relative = np.clip(episode.logvar - reference, -MAX_LOG_NOISE, MAX_LOG_NOISE)
-    return Evidence.of([(episode.features, episode.residual, np.exp(relative))])
-
-
-@eqx.filter_jit
-def _look(
-    model: MultiHeadDynamics,
-    task: Task,
-    statistics: Statistics,
-    episode: Episodes,
-    history_length: int,
-) -> Seen:
-    """All transitions of an episode, each with the context of the moment after it."""
-    moments = jnp.arange(episode.action.shape[1]) + 1
-    return see_episode(model, task, statistics, episode, 0, moments, history_length)
-
-
-def _spread(count: int, most: int) -> list[int]:
-    """At most so many indices, evenly spread."""
-    return sorted({*np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist()})
+def _spread(items: Sequence[Item], most: int) -> list[Item]:
+    """At most so many, evenly spread."""
+    count = len(items)
+    places = np.linspace(0, count - 1, min(count, most)).round().astype(int)
+    return [items[i] for i in sorted({*places.tolist()})]

@@ -3,16 +3,16 @@
 What a head's mean misses is modelled as a linear function of the features φ that the head sees:
 the backbone's output, the context and a 1. For every environment, member, head and dimension o,
 
-    r_o = φᵀ w_o + ε,    w_o ~ N(0, σ_o² ρ I),    ε ~ N(0, σ_o² n),
+    r_o = φᵀ w_o + ε,    w_o ~ N(0, σ_o² ρ R Rᵀ),    ε ~ N(0, σ_o² n),
 
-where r is the normalised delta minus the head's mean, ρ and σ² come from the training data
+where r is the normalised delta minus the head's mean, ρ, R and σ² come from the training data
 (`prior`), and n is 1 or says how noisy the head holds this transition to be. The posterior
 covariance is σ_o² P, and P depends on the features only, so the dimensions share it.
 
 Every transition is one step of a Kalman filter, in closed form. The chosen head's posterior mean
 is then added to its weights before the plan, so imagined rollouts cost nothing more. With
 `forgetting` the weights follow an Ornstein-Uhlenbeck process whose stationary distribution is
-the prior: P never exceeds ρ I, however long an episode is.
+the prior: P never exceeds ρ R Rᵀ, however long an episode is.
 
 Sources: Bayesian linear regression (Bishop, 2006, section 3.3); ALPaCA (Harrison et al., 2018);
 Potter's square-root filter (Maybeck, 1979, section 7.3).
@@ -37,6 +37,15 @@ MAX_LOG_NOISE = 7.0
 TINY = 1e-12
 
 
+class Shape(NamedTuple):
+    """How the prior is spread over the features: a correction's covariance is σ² ρ R Rᵀ."""
+
+    root: Float[Array, "member feature feature"]
+    """R."""
+    inverse: Float[Array, "member feature feature"]
+    """R⁻¹."""
+
+
 class Prior(NamedTuple):
     """What an episode is expected to ask of the heads, per member."""
 
@@ -46,6 +55,18 @@ class Prior(NamedTuple):
     """Variance of the noise in normalised units (σ²)."""
     log_reference: Float[Array, " member"]
     """Log-variance that the heads claim on average; relative noise n is measured against it."""
+    shape: Shape | None = None
+    """None where all weights are equally uncertain (R = I)."""
+
+    @property
+    def members(self) -> int:
+        """Networks in the ensemble."""
+        return self.ratio.shape[0]
+
+    def root(self, size: int) -> Float[Array, "member size size"]:
+        """Square root of the prior covariance in units of the noise variance, √ρ R."""
+        shape = jnp.eye(size) if self.shape is None else self.shape.root
+        return jnp.sqrt(self.ratio)[:, None, None] * shape
 
 
 class Seen(NamedTuple):
@@ -183,11 +204,10 @@ class LastLayer(NamedTuple):
             groups: 1 if all heads share their noise, else the number of heads.
         """
         heads, features, obs_size = sizes
-        members = prior.ratio.shape[0]
-        start = jnp.sqrt(prior.ratio)[:, None, None, None] * jnp.eye(features)
+        start = prior.root(features)[:, None]
         return cls(
-            jnp.zeros((num_envs, members, heads, features, obs_size)),
-            jnp.broadcast_to(start, (num_envs, members, groups, features, features)),
+            jnp.zeros((num_envs, prior.members, heads, features, obs_size)),
+            jnp.broadcast_to(start, (num_envs, prior.members, groups, features, features)),
         )
 
 
@@ -218,8 +238,8 @@ def forecast(state: LastLayer, seen: Observed) -> Forecast:
 
 def first_forecast(prior: Prior, seen: Observed) -> Forecast:
     """The forecast of heads that have learned nothing yet."""
-    ratio = prior.ratio[:, None, None]
-    projected = jnp.sqrt(ratio) * seen.features[..., None, :]
+    root = prior.root(seen.features.shape[-1])
+    projected = jnp.einsum("mij,emi->emj", root, seen.features)[..., None, :]
     spread = seen.noise + jnp.square(projected).sum(-1)
     return Forecast(seen.residual, projected, spread)
 
@@ -246,10 +266,13 @@ def forget(state: LastLayer, prior: Prior, share: float) -> LastLayer:
         prior: Where the weights drift.
         share: Share of the covariance that is the prior's again after one step; above 0.
     """
-    ratio = prior.ratio[:, None, None, None]
-    covariance = state.root @ state.root.mT / jnp.maximum(ratio, TINY)
-    mixed = (1.0 - share) * covariance + share * jnp.eye(state.root.shape[-1])
-    root = jnp.sqrt(ratio) * jnp.linalg.cholesky(mixed)
+    scale = jnp.sqrt(jnp.maximum(prior.ratio, TINY))[:, None, None, None]
+    relative = state.root / scale
+    if prior.shape is not None:
+        relative = prior.shape.inverse[:, None] @ relative
+    size = relative.shape[-1]
+    mixed = (1.0 - share) * relative @ relative.mT + share * jnp.eye(size)
+    root = prior.root(size)[:, None] @ jnp.linalg.cholesky(mixed)
     return LastLayer((1.0 - share) ** 0.5 * state.weight, root)
 
 

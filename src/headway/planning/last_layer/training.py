@@ -30,7 +30,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from headway.models.dynamics import MultiHeadDynamics
 from headway.models.fitting import FitData, FitSetup
-from headway.planning.last_layer.prior import MIN_NOISE
+from headway.planning.last_layer.evidence import MIN_NOISE
 from headway.planning.last_layer.regression import (
     LastLayer,
     Observed,
