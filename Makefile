@@ -25,7 +25,7 @@ demo: $(VENV)/main.stamp ## Train and evaluate T-MCL on Pendulum, in minutes
 test: $(VENV)/test.stamp ## Run the tests; JOBS=4 runs four at a time
 	@$(BIN)/python -m pytest -n $(JOBS) -m "not slow"
 
-test-slow: $(VENV)/test.stamp ## Run the tests that take minutes each
+test-slow: $(VENV)/test.stamp $(VENV)/docs.stamp ## Run the tests that take minutes each
 	@$(BIN)/python -m pytest -m slow
 
 lint: $(VENV)/test.stamp $(VENV)/lint.stamp ## Check style, types and import rules
@@ -55,14 +55,17 @@ bench-runs: $(VENV)/main.stamp ## Time the paper's whole HalfCheetah and Pendulu
 profile: $(VENV)/main.stamp ## Print what share of a plan its parts take
 	@$(BIN)/python benchmarks/profile_plan.py
 
-docs: $(VENV)/test.stamp ## Check that the links in README and docs lead somewhere (there is no site yet)
+docs: $(VENV)/test.stamp $(VENV)/docs.stamp ## Check links; write the site, guides and API reference, to site/
 	@$(BIN)/python -m pytest tests/test_package.py -k links
+	@rm -rf site
+	@$(BIN)/python -m sphinx -q -W --keep-going -c docs/site -d build/docs -E . site
+	@echo "The site is in site/index.html"
 
 constraints: ## Rewrite constraints.txt from fresh installs of the newest versions
 	@for python in $(CONSTRAINED_PYTHONS); do \
 		venv=$(VENV)-constraints/$$(basename $$python) && rm -rf $$venv && echo "$$python: installing" && \
 		$$python -m venv $$venv && $$venv/bin/python -m pip install -qq --upgrade pip && \
-		$$venv/bin/python -m pip install -qq . --group test --group bench --group lint && \
+		$$venv/bin/python -m pip install -qq . --group test --group bench --group lint --group docs && \
 		$$venv/bin/python -m pip freeze --all --exclude headway --exclude setuptools \
 			| LC_ALL=C sort > $$venv.txt || exit 1; \
 	done
@@ -75,7 +78,7 @@ constraints: ## Rewrite constraints.txt from fresh installs of the newest versio
 	@mv $(VENV)-constraints/new.txt constraints.txt
 
 clean: ## Remove caches and build leftovers; keeps .venv, runs and saved results
-	@rm -rf build dist .pytest_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks
+	@rm -rf build dist site .pytest_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks
 	@rm -rf $(VENV)-constraints benchmarks/latest MUJOCO_LOG.TXT
 	@find src tests benchmarks results -name __pycache__ -type d -prune -exec rm -rf {} +
 

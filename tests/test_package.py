@@ -177,7 +177,7 @@ def test_make_clean_removes_caches_and_nothing_else(tmp_path):
         if folder.is_dir() and not folder.name.startswith("."):
             (tmp_path / folder.name / "inside").mkdir(parents=True)
     shutil.copy(ROOT / "Makefile", tmp_path)
-    left_over = {"build", "dist"}
+    left_over = {"build", "dist", "site"}
     kept = sorted(path for path in tmp_path.rglob("*") if not left_over & set(path.parts))
     (tmp_path / "src" / "inside" / "__pycache__").mkdir()
     subprocess.run(["make", "clean"], cwd=tmp_path, check=True, capture_output=True)

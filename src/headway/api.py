@@ -211,7 +211,7 @@ def evaluate(
 
     Args:
         run_dir: The run directory.
-        groups: `train` or unseen groups; all of them by default.
+        groups: `"train"` or unseen groups; all of them by default.
         num_episodes: Episodes per group; the run's own number by default.
         settings: Changes of `planner` and `evaluation` settings by dotted name, for example
             `{"planner.num_candidates": 50}`, to test the model with another planner.

@@ -21,10 +21,15 @@ class Trajectory:
     """
 
     obs: Float[np.ndarray, "time_plus_1 obs"]
+    """As the environment returned them, the last one included."""
     action: Float[np.ndarray, "time action"]
+    """What led from each observation to the next."""
     reward: Float[np.ndarray, " time"]
+    """What the environment paid for it."""
     sim_params: Mapping[str, float]
+    """The physics of the episode."""
     terminated: bool = False
+    """Whether the episode ended for good, and not because its time was up."""
 
     def __post_init__(self):
         steps = len(self.action)

@@ -20,8 +20,11 @@ class Method:
     """A way of learning and planning, as differences from T-MCL."""
 
     name: str
+    """How the command line names it."""
     description: str
+    """One line for lists."""
     settings: Settings
+    """What differs from T-MCL, by dotted name."""
     by_preset: Mapping[str, Settings] = dataclasses.field(default_factory=dict)
     """What replaces some of them in a preset, by its name."""
 
@@ -187,7 +190,7 @@ _BUILT_IN = tuple(METHODS)
 def register_method(method: Method) -> None:
     """Add a method of your own, or replace an earlier one of the same name.
 
-    Its settings may name a `model.kind` of your own (`learners.register_learner`).
+    Its settings may name a `model.kind` of your own (`register_learner`).
 
     Raises:
         ConfigError: It has the name of a built-in method, or its settings are not allowed.

@@ -231,11 +231,15 @@ class MultiHeadDynamics(eqx.Module):
     """An ensemble of multi-headed networks, with optional context and backward net."""
 
     forward_net: GaussianNet
+    """Predicts the change from an observation to the next."""
     backward_net: GaussianNet | None
+    """Predicts the change back; it only shapes the context."""
     context_encoder: ContextEncoder | None
+    """Turns past transitions into a context."""
     relation_head: Dense | None = None
     """Tells from two contexts, one after the other, whether they are of one trajectory."""
     context_kind: ContextKind = eqx.field(static=True, default="learned")
+    """What the networks are told of the hidden physics."""
     sim_param_names: tuple[str, ...] = eqx.field(static=True, default=())
     """The true simulator parameters that are its context, in their order; mostly none."""
 

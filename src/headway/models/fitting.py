@@ -58,9 +58,13 @@ class EpochStats(NamedTuple):
     """Averages over the updates of one epoch."""
 
     loss: Float[Array, ""]
+    """What was minimised, over the updates that were taken."""
     forward_loss: Float[Array, ""]
+    """The part of it that predicts forwards in time."""
     skipped: Int[Array, ""]
+    """Updates that were not taken, because a number was not finite."""
     updates: Int[Array, ""]
+    """All updates, skipped ones included."""
 
 
 class FitData(NamedTuple):

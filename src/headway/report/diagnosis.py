@@ -82,7 +82,7 @@ def diagnose(
 
     Args:
         run_dir: The run directory.
-        groups: `train` or unseen groups; all of them by default.
+        groups: `"train"` or unseen groups; all of them by default.
         num_episodes: Episodes per group to run tests with; by default those of the run are taken.
         collected: Take the episodes that the last iteration collected instead. The model has
             learned from these since.

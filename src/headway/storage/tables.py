@@ -26,14 +26,23 @@ class EpisodeRow:
     """One test episode; a row of `evaluation.csv`."""
 
     method: str
+    """What was trained."""
     env: str
+    """Short name of the environment."""
     seed: int
+    """The run's seed."""
     iteration: int
+    """After which iteration it was tested, counted from 0."""
     group: str
+    """`"train"` or the name of an unseen group."""
     sim_params: Mapping[str, float]
+    """The physics of the episode."""
     episode: int
+    """Which of the group's episodes, counted from 0."""
     episode_return: float
+    """Undiscounted sum of rewards; `return` in the table."""
     length: int
+    """Steps of the episode."""
 
     def to_csv(self) -> dict[str, Any]:
         """The row as it is written."""

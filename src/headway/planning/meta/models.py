@@ -24,9 +24,13 @@ class Transition(NamedTuple):
     """One step of every environment, and where it happened at all."""
 
     obs: Float[Array, "env obs"]
+    """Before the step."""
     action: Float[Array, "env action"]
+    """Scaled to [-1, 1]."""
     next_obs: Float[Array, "env obs"]
+    """After the step."""
     happened: Bool[Array, " env"]
+    """Where there was such a step; not at the beginning of an episode."""
 
 
 @runtime_checkable
