@@ -187,3 +187,21 @@ def test_a_head_that_owns_one_physics_stays():
     assert replacements(owned, 0.2).tolist() == [[0, 1, 0]]
     assert replacements(owned, 0.1).tolist() == [[0, 1, 2]]
     assert replacements(owned, 0.3).tolist() == [[0, 0, 0]]
+
+
+def test_foresight_is_measured_once_and_drawn(run_dir, run_script, tmp_path, capsys):
+    words = [run_dir, "--table", tmp_path / "fore.csv", "--figure", tmp_path / "fore.png"]
+    found = run_script("foresight.py", *words)
+    printed = capsys.readouterr().out
+    rows = read_csv(tmp_path / "fore.csv", found["COLUMNS"])
+    errors = {row["head"]: [] for row in rows}
+    for row in rows:
+        errors[row["head"]].append(float(row["relative_error"]))
+    assert set(errors) == {"owner", "runner-up"}
+    for of_head in errors.values():
+        assert of_head[0] == pytest.approx(1.0, abs=0.01)  # the least ratio learns nothing
+        assert min(of_head) < 1.0
+    (tmp_path / "fore.png").unlink()
+    run_script("foresight.py", *words)
+    assert capsys.readouterr().out == printed
+    assert (tmp_path / "fore.png").stat().st_size > 10_000

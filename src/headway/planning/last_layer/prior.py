@@ -51,7 +51,7 @@ def fit_prior(
             (`adaptation_prior`), what the noise is like, and how far plans look ahead.
     """
     onlooker = Onlooker(model, task, statistics, history_length, planner.adaptation_prior)
-    chosen = _spread(trajectories, MAX_EPISODES)
+    chosen = evenly_spread(trajectories, MAX_EPISODES)
     # Small matrices, one after the other: BLAS threads only wait for each other, and for long
     # where the cores have other work too.
     with threadpool_limits(1, user_api="blas"):
@@ -72,7 +72,7 @@ def _foreseen_best(
     onlooker: Onlooker, trajectories: Sequence[Trajectory], horizon: int, references: References
 ) -> tuple[Shape, float]:
     """The spread over the features of each member and the ratio that foresee most."""
-    chosen = _spread(trajectories, foresight.MAX_EPISODES)
+    chosen = evenly_spread(trajectories, foresight.MAX_EPISODES)
     moments = [foresight.moments_of(len(t), i) for i, t in enumerate(chosen)]
     directions = foresight.directions_of(onlooker.episodes(chosen))
     errors = []
@@ -116,7 +116,7 @@ def _mean_logvar(claims: Iterable[list[tuple[float, int]]]) -> list[float]:
     return (sums[:, 0] / sums[:, 1]).tolist()
 
 
-def _spread(items: Sequence[Item], most: int) -> list[Item]:
+def evenly_spread(items: Sequence[Item], most: int) -> list[Item]:
     """At most so many, evenly spread."""
     count = len(items)
     places = np.linspace(0, count - 1, min(count, most)).round().astype(int)
