@@ -64,8 +64,8 @@ def fit_prior(
         evidence, references = _reduced(onlooker.episodes(chosen), relative, shape)
         ratios = [of_member.best_ratio() if ratio is None else ratio for of_member in evidence]
     noise = [of_member.noise(r) for of_member, r in zip(evidence, ratios, strict=True)]
-    columns = (jnp.asarray(np.asarray(x), jnp.float32) for x in (ratios, noise, references))
-    return Prior(*columns, shape)
+    columns = [jnp.asarray(np.asarray(x), jnp.float32) for x in (ratios, noise, references)]
+    return Prior(columns[0], columns[1], columns[2], shape)
 
 
 def _foreseen_best(

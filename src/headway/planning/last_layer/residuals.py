@@ -28,7 +28,7 @@ class Residuals(NamedTuple):
 
     def part(self, steps: slice) -> "Residuals":
         """Some of the transitions."""
-        return Residuals(*(x[steps] for x in self[:3]), self.head)
+        return Residuals(self.features[steps], self.residual[steps], self.logvar[steps], self.head)
 
     def relative_noise(self, reference: float | None) -> Float[np.ndarray, " time"]:
         """Variance of the noise over what the heads claim on average; 1 without a reference."""
