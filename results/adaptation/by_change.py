@@ -11,9 +11,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from by_method import COLORS, Row, Scores, draw, label
+from by_method import Row, Scores, colors_of, draw, handles_of, label
 from changes import COLUMNS
-from matplotlib.lines import Line2D
 
 from headway.report import style
 from headway.storage.records import read_csv
@@ -44,7 +43,7 @@ def ordered(returns: Scores) -> list[str]:
 
 def save_figure(jumps: Scores, drifts: Scores, path: Path) -> None:
     """Jumps on the left, drifts on the right."""
-    methods = ordered(jumps)
+    methods, colors = ordered(jumps), colors_of(jumps)
     caption = (
         "A dot is one run (mean over changes and episodes), a bar the mean over runs. Return from"
         " the change to the end of the episode. Same trained models, same episodes for all arms."
@@ -54,14 +53,9 @@ def save_figure(jumps: Scores, drifts: Scores, path: Path) -> None:
     with style.figure(path, title=title, caption=caption, size=size) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
         for axes, returns, name in ((left, jumps, "a jump"), (right, drifts, "a drift")):
-            draw(axes, returns, methods)
+            draw(axes, returns, methods, colors)
             style.label_axis(axes, f"return after {name}", "")
-        arms = dict.fromkeys(arm for method in methods for arm in jumps[method])
-        handles = [
-            Line2D([], [], color=color, marker="o", linestyle="", label=label(arm))
-            for arm, color in zip(arms, COLORS, strict=False)
-        ]
-        style.legend(figure, handles)
+        style.legend(figure, handles_of(colors))
 
 
 def print_table(tables: list[list[Row]]) -> None:

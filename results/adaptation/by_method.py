@@ -2,8 +2,8 @@
 
     python results/adaptation/by_method.py results/adaptation/NAME results/adaptation/NAME.png
 
-The folder holds one table of `measure.py` per run. Methods with two arms are compared; the same
-numbers are printed as a Markdown table.
+The folder holds one table of `measure.py` per run. Methods with two arms are compared. The figure
+has the arms that all of them were tested with; all are printed as a Markdown table.
 """
 
 import sys
@@ -42,15 +42,16 @@ def order(scores: Scores) -> list[str]:
 
 
 def colors_of(scores: Scores) -> dict[str, str]:
-    """The same color for an arm in all methods."""
-    arms = dict.fromkeys(arm for of_method in scores.values() for arm in of_method)
-    return dict(zip(arms, COLORS, strict=False))
+    """A color for every arm that all methods with several arms were tested with."""
+    several = [arms for arms in scores.values() if len(arms) > 1] or list(scores.values())
+    shared = [arm for arm in several[0] if all(arm in arms for arms in several)]
+    return dict(zip(shared, COLORS, strict=False))
 
 
 def draw(axes: Axes, scores: Scores, methods: list[str], colors: dict[str, str]) -> None:
     """A row per method, with an arm above the other; a dot per run, a bar at each arm's mean."""
     for row, method in enumerate(methods):
-        arms = scores[method]
+        arms = {arm: scores[method][arm] for arm in colors if arm in scores[method]}
         places = row + 0.2 * (np.arange(len(arms)) - (len(arms) - 1) / 2)
         means = [np.mean(values) for values in arms.values()]
         axes.plot(means, places, color=style.THREAD, lw=3, zorder=1)
@@ -78,16 +79,21 @@ def save_figure(training: Scores, unseen: Scores, path: Path, source: str) -> No
         for axes, scores, name in ((left, training, "training"), (right, unseen, "unseen")):
             draw(axes, scores, methods, colors)
             style.label_axis(axes, f"score on {name} physics", "")
-        handles = [
-            Line2D([], [], color=color, marker="o", linestyle="", label=label(arm))
-            for arm, color in colors.items()
-        ]
-        style.legend(figure, handles)
+        style.legend(figure, handles_of(colors))
+
+
+def handles_of(colors: dict[str, str]) -> list[Line2D]:
+    """What explains the colors."""
+    return [
+        Line2D([], [], color=color, marker="o", linestyle="", label=label(arm))
+        for arm, color in colors.items()
+    ]
 
 
 def label(arm: str) -> str:
     """How an arm is called for readers."""
-    return "frozen heads" if arm == FROZEN else arm
+    name = arm.replace("likelihood", "last layer, prior by likelihood").replace("-layer", " layer")
+    return "frozen heads" if arm == FROZEN else name
 
 
 def print_table(training: Scores, unseen: Scores) -> None:
