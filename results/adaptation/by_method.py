@@ -70,7 +70,7 @@ def save_figure(training: Scores, unseen: Scores, path: Path, source: str) -> No
     caption = (
         f"A dot is one run (mean over physics), a bar the mean over runs; from {source}. Score: 0"
         " is random, 1 the planner on the true dynamics. Same trained models, same test"
-        " episodes for all arms; nothing was chosen on unseen physics."
+        " episodes for all arms; no number was chosen on unseen physics."
     )
     title = "Heads that keep learning while they act, by method"
     size = (8.0, 1.9 + 0.42 * len(methods))

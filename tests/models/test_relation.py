@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -88,7 +89,7 @@ def losses_twin(model, batch, states):
 def test_losses_and_weights_equal_a_loop_over_pairs(transitions):
     model, batch = toys.small_model(config=RIA), random_batch()
     config = dataclasses.replace(CONFIG, relation_transitions=transitions)
-    pull, similar = intervene(model, toys.POINT, STATISTICS, batch, config)
+    pull, similar = eqx.filter_jit(intervene)(model, toys.POINT, STATISTICS, batch, config)
     relation, _ = relation_gradient(model, STATISTICS, batch, similar, 0.0)
     expected = losses_twin(model, batch, states=range(transitions or 4))
     np.testing.assert_allclose(pull, expected[0], rtol=1e-4)
@@ -180,7 +181,7 @@ def test_the_relation_loss_has_an_adam_of_its_own_and_starts_from_the_same_weigh
     order = jnp.broadcast_to(jnp.arange(8), (2, 8))
     batch, _ = gather_batch(data, None, order, jnp.ones((2, 8)), setup)
     state = setup.init(model)
-    both, _ = update(state, setup, data, batch, None)
+    both, _ = eqx.filter_jit(update)(state, setup, data, batch, None)
     # Adam's first step has the size of the learning rate in every weight that has a gradient.
     moved = jax.tree.map(lambda a, b: np.abs(np.asarray(a - b)), both.model, model)
     np.testing.assert_allclose(moved.forward_net.hidden[0].weight.max(), 1e-3, rtol=1e-2)
