@@ -19,7 +19,7 @@ from measure import name_of
 from headway.config import PlannerConfig
 from headway.experiment.loading import load_learned, load_task
 from headway.planning.last_layer import foresight
-from headway.planning.last_layer.prior import RANKS, evenly_spread, fit_prior
+from headway.planning.last_layer.prior import fit_prior, foreseen_errors
 from headway.planning.last_layer.residuals import Onlooker
 from headway.report import style
 from headway.storage.records import read_csv, write_csv
@@ -35,10 +35,10 @@ def measure(run: RunDir) -> list[Row]:
     config, trajectories = run.config(), run.load_data()
     learned, task = load_learned(run, config), load_task(config)
     model, length = learned.fit.model, config.model.history_length
-    chosen = evenly_spread(trajectories, foresight.MAX_EPISODES)
-    moments = [foresight.moments_of(len(t), i) for i, t in enumerate(chosen)]
     onlooker = Onlooker(model, task, learned.statistics, length)
-    directions = foresight.directions_of(onlooker.episodes(chosen))
+    directions, errors = foreseen_errors(
+        onlooker, trajectories, config.planner.horizon, [None] * model.num_members
+    )
     likely = fit_prior(
         model,
         task,
@@ -50,12 +50,8 @@ def measure(run: RunDir) -> list[Row]:
     # In units of an average transition, as foresight's ratios are.
     scale = np.mean([one.values.sum() for one in directions])
     rows = []
-    for rank in RANKS[: model.num_heads]:
-        foreseen = onlooker._replace(rank=rank).from_moments(chosen, moments)
-        errors = foresight.relative_errors(
-            foreseen, directions, config.planner.horizon, [None] * model.num_members
-        )
-        for (i, j), error in np.ndenumerate(errors):
+    for rank, of_rank in errors.items():
+        for (i, j), error in np.ndenumerate(of_rank):
             rows.append(
                 {
                     "run": name_of(run.path),

@@ -16,7 +16,6 @@ it errs without learning. The first is what acts on known physics and should los
 second imitates physics that no head was made for, with no data but those of training.
 """
 
-import itertools
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
@@ -70,12 +69,11 @@ class Directions(NamedTuple):
 
 def directions_of(episodes: Iterable[list[Residuals]]) -> list[Directions]:
     """How the features of each member vary over some episodes."""
-    total, steps = [np.zeros(())], 0
+    total, steps = np.zeros(()), 0
     for episode in episodes:
-        products = [one.features.T @ one.features for one in episode]
-        total = [x + y for x, y in zip(itertools.cycle(total), products)]
+        total = total + np.stack([one.features.T @ one.features for one in episode])
         steps += len(episode[0].features)
-    return [Directions.of(of_member / steps) for of_member in total]
+    return [Directions.of(of_member) for of_member in total / steps]
 
 
 def best(relative_errors: Sequence[Errors]) -> tuple[float, float]:

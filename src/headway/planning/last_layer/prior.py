@@ -51,7 +51,7 @@ def fit_prior(
             (`adaptation_prior`), what the noise is like, and how far plans look ahead.
     """
     onlooker = Onlooker(model, task, statistics, history_length, planner.adaptation_prior)
-    chosen = evenly_spread(trajectories, MAX_EPISODES)
+    chosen = _evenly_spread(trajectories, MAX_EPISODES)
     # Small matrices, one after the other: BLAS threads only wait for each other, and for long
     # where the cores have other work too.
     with threadpool_limits(1, user_api="blas"):
@@ -72,17 +72,32 @@ def _foreseen_best(
     onlooker: Onlooker, trajectories: Sequence[Trajectory], horizon: int, references: References
 ) -> tuple[Shape, float]:
     """The spread over the features of each member and the ratio that foresee most."""
-    chosen = evenly_spread(trajectories, foresight.MAX_EPISODES)
-    moments = [foresight.moments_of(len(t), i) for i, t in enumerate(chosen)]
-    directions = foresight.directions_of(onlooker.episodes(chosen))
-    errors = []
-    for rank in RANKS[: onlooker.model.num_heads]:
-        foreseen = onlooker._replace(rank=rank).from_moments(chosen, moments)
-        errors.append(foresight.relative_errors(foreseen, directions, horizon, references))
-    power, ratio = foresight.best(errors)
+    directions, errors = foreseen_errors(onlooker, trajectories, horizon, references)
+    power, ratio = foresight.best([*errors.values()])
     roots = np.stack([one.root(power) for one in directions])
     inverses = np.stack([one.inverse(power) for one in directions])
     return Shape(*(jnp.asarray(x, jnp.float32) for x in (roots, inverses))), ratio
+
+
+def foreseen_errors(
+    onlooker: Onlooker, trajectories: Sequence[Trajectory], horizon: int, references: References
+) -> tuple[list[foresight.Directions], dict[Rank, foresight.Errors]]:
+    """How the features of each member vary, and the relative errors of the heads of each rank.
+
+    Args:
+        onlooker: Looks at the episodes.
+        trajectories: Training episodes.
+        horizon: Transitions ahead that count.
+        references: As `foresight.relative_errors` wants them.
+    """
+    chosen = _evenly_spread(trajectories, foresight.MAX_EPISODES)
+    moments = [foresight.moments_of(len(t), i) for i, t in enumerate(chosen)]
+    directions = foresight.directions_of(onlooker.episodes(chosen))
+    errors = {}
+    for rank in RANKS[: onlooker.model.num_heads]:
+        foreseen = onlooker._replace(rank=rank).from_moments(chosen, moments)
+        errors[rank] = foresight.relative_errors(foreseen, directions, horizon, references)
+    return directions, errors
 
 
 def _reduced(
@@ -116,7 +131,7 @@ def _mean_logvar(claims: Iterable[list[tuple[float, int]]]) -> list[float]:
     return (sums[:, 0] / sums[:, 1]).tolist()
 
 
-def evenly_spread(items: Sequence[Item], most: int) -> list[Item]:
+def _evenly_spread(items: Sequence[Item], most: int) -> list[Item]:
     """At most so many, evenly spread."""
     count = len(items)
     places = np.linspace(0, count - 1, min(count, most)).round().astype(int)
