@@ -13,7 +13,7 @@ from headway.data import Episodes, Samples
 from headway.models.compilation import compiler_options, jit_networks
 from headway.models.dynamics import Statistics
 from headway.models.fitting import assign_segments, fit_epoch, make_data
-from headway.models.meeting import Program, stack
+from headway.models.meeting import Program, in_groups, stack
 from headway.planning.step import _act
 from headway.tasks.catalog import env_spec
 
@@ -63,23 +63,23 @@ def epoch(transitions: int = 10_000, members: int = MODEL.num_members) -> Work:
 
 
 def plan_of_seeds(seeds: int) -> Work:
-    """One plan of every seed, in one program."""
+    """One plan of every seed, as seeds that are trained together are computed."""
     agent, state, obs = make_agent(NUM_ENVS, MODEL, PLANNER)
     return _over_seeds(_act, seeds, (agent, state, obs), {})
 
 
 def epoch_of_seeds(seeds: int) -> Work:
-    """One epoch of every seed, in one program."""
+    """One epoch of every seed, likewise."""
     state, setup, data = make_fit(5, 5, MODEL, FITTING)
     named = {"independent": False, "key": jax.random.key(2)}
     return _over_seeds(inspect.unwrap(fit_epoch), seeds, (state, setup, data), named)
 
 
 def _over_seeds(function: Callable, seeds: int, *arguments: Any) -> Work:
-    """A function of arguments that all seeds have, mapped over the seeds."""
-    stacked = stack([arguments] * seeds)
+    """A function of arguments that all seeds have, mapped over each group of seeds."""
+    groups = [stack(group) for group in in_groups([arguments] * seeds)]
     program = Program(function, lambda: {"compiler_options": compiler_options()})
-    return lambda: program.together(stacked)
+    return lambda: [program.together(group) for group in groups]
 
 
 def assignment(transitions: int) -> Work:

@@ -73,7 +73,8 @@ def of_moment(
         return (jnp.square(left).mean((1, 2)) * judged).sum() / judged.sum(), nll
 
     of_member = jax.vmap(of_rank, in_axes=(None, 1, None))
-    return jax.vmap(of_member, in_axes=(1, 1, 0))(seen.features, residual, loss.ratio)
+    features = loss.prior.even(seen.features)
+    return jax.vmap(of_member, in_axes=(1, 1, 0))(features, residual, loss.prior.ratio)
 
 
 def measure(

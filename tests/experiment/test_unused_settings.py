@@ -108,6 +108,9 @@ def test_what_a_method_can_use_separates_runs():
     assert not separates("tmcl", "planner.warm_min_std", **warm, **mppi)
     assert separates("pets", "fitting.adaptation_epochs")
     assert not separates("grbal", "fitting.adaptation_epochs")
+    trained_for = {"fitting.adaptation_epochs": 5}
+    assert separates("tmcl", "planner.adaptation_criterion", **trained_for)
+    assert not separates("tmcl", "planner.change_threshold", **trained_for)
     assert separates("tmcl", "fitting.segment_length")
     assert not separates("mcl", "fitting.segment_length")
     assert separates("mcl", "fitting.warmup_iterations")

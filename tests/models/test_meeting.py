@@ -46,9 +46,9 @@ def groups(monkeypatch):
     """How many calls were computed together each time, 1 for one by itself."""
     sizes, whole = [], Meeting._results
 
-    def results(self, calls):
+    def results(self, calls, stacks):
         sizes.append(len(calls))
-        return whole(self, calls)
+        return whole(self, calls, stacks)
 
     monkeypatch.setattr(Meeting, "_results", results)
     return sizes
@@ -73,6 +73,16 @@ def test_calls_that_are_alike_are_computed_together(groups):
     runs = [walker(seed) for seed in range(3)]
     found = side_by_side(Meeting(), *runs)
     assert groups == [3, 3, 3]
+    for future, run in zip(found, runs, strict=True):
+        assert_same(future, run)
+
+
+@pytest.mark.parametrize(("most", "wanted"), [(2, [2, 2, 1] * 3), (3, [3, 2] * 3)])
+def test_a_cpu_computes_a_few_at_once(groups, monkeypatch, most, wanted):
+    monkeypatch.setattr(meetings, "MOST_ON_CPU", most)
+    runs = [walker(seed) for seed in range(5)]
+    found = side_by_side(Meeting(), *runs)
+    assert groups == wanted
     for future, run in zip(found, runs, strict=True):
         assert_same(future, run)
 
@@ -160,7 +170,9 @@ def test_a_closed_meeting_stops_those_who_wait():
     assert absent.call is None
 
 
-def test_what_stays_the_same_is_stacked_once(monkeypatch):
+@pytest.mark.parametrize("groups", [1, 2])
+def test_what_stays_the_same_is_stacked_once(monkeypatch, groups):
+    monkeypatch.setattr(meetings, "MOST_ON_CPU", 2)
     stacked, whole = [], meetings.stack
 
     def stack(trees):
@@ -168,11 +180,11 @@ def test_what_stays_the_same_is_stacked_once(monkeypatch):
         return whole(trees)
 
     monkeypatch.setattr(meetings, "stack", stack)
-    side_by_side(Meeting(), walker(0), walker(1))
+    side_by_side(Meeting(), *[walker(seed) for seed in range(2 * groups)])
     numbers = [x for x in stacked if eqx.is_array(x) and jnp.issubdtype(x.dtype, jnp.floating)]
-    assert [x.shape for x in numbers] == [(4,), ()]  # the first state and the step, never again
+    assert [x.shape for x in numbers] == [(4,), ()] * groups  # state and step, never again
     keys = [x for x in stacked if eqx.is_array(x) and not jnp.issubdtype(x.dtype, jnp.floating)]
-    assert len(keys) == 3  # a new one every time
+    assert len(keys) == 3 * groups  # a new one every time
 
 
 def test_memory_is_shared_by_the_seeds(monkeypatch):

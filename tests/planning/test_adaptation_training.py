@@ -19,6 +19,7 @@ from headway.planning.last_layer.regression import (
     Observed,
     Prior,
     Seen,
+    Shape,
     forecast,
     update,
 )
@@ -61,16 +62,29 @@ def seen_at(model, data, episode, step, past):
     return Seen.through(model, toys.POINT, data.statistics, transition, context)
 
 
+def prior_of(ratio, shape=None):
+    return Prior(jnp.broadcast_to(jnp.asarray(ratio), 2), jnp.ones((2, 2)), jnp.zeros(2), shape)
+
+
+def spread(size):
+    """A prior that is spread unevenly over the features, otherwise in each member."""
+    rng = np.random.default_rng(size)
+    root = np.eye(size) * rng.uniform(0.5, 2.0, size) + 0.1 * rng.normal(size=(2, size, size))
+    return Shape(*(jnp.asarray(x, jnp.float32) for x in (root, np.linalg.inv(root))))
+
+
 @eqx.filter_jit
 def at(loss, model, data, moment):
     return loss.at(model, data, moment)
 
 
-@pytest.mark.parametrize(("episode", "learned"), [(0, 1), (0, 5), (1, 7)])
-def test_the_loss_is_that_of_heads_which_learned_step_by_step(odd_data, episode, learned):
+@pytest.mark.parametrize(
+    ("episode", "learned", "shape"), [(0, 1, None), (0, 5, spread(12)), (1, 7, None)]
+)
+def test_the_loss_is_that_of_heads_which_learned_step_by_step(odd_data, episode, learned, shape):
     """The filter that acts learns from the first transitions, and predicts the others."""
     model, length = toys.small_model(), STEPS - episode
-    prior = Prior(jnp.asarray([0.5, 20.0]), jnp.ones((2, 2)), jnp.zeros(2))
+    prior = prior_of([0.5, 20.0], shape)
     layer, everywhere = LastLayer.of_prior(prior, 1, (2, 12, 2)), jnp.ones(1, bool)
     squares = np.zeros((2, 2))
     for step in range(learned):
@@ -85,10 +99,10 @@ def test_the_loss_is_that_of_heads_which_learned_step_by_step(odd_data, episode,
         expected = forecast(layer, Observed.of(seen, everywhere))
         errors.append(np.asarray(expected.innovation[0], np.float64))
         spreads.append(np.asarray(expected.spread[0, :, 0], np.float64))
-    error, spread = np.square(errors), np.asarray(spreads)
-    noise = (error / spread[:, :, None, None]).mean(0)
-    wanted = np.log(noise).mean((1, 2)) + np.log(spread).mean(0)
-    loss = AdaptationLoss(toys.POINT, HISTORY, prior.ratio)
+    error, wide = np.square(errors), np.asarray(spreads)
+    noise = (error / wide[:, :, None, None]).mean(0)
+    wanted = np.log(noise).mean((1, 2)) + np.log(wide).mean(0)
+    loss = AdaptationLoss(toys.POINT, HISTORY, prior)
     found = at(loss, model, odd_data, moment(episode, learned))
     np.testing.assert_allclose(found, wanted, rtol=2e-4)
 
@@ -138,7 +152,7 @@ def gradient(model, loss, data, moment):
 @pytest.mark.parametrize("ratio", [1.0, 1e7])
 def test_it_teaches_features_and_contexts_but_not_heads(odd_data, ratio):
     model = toys.small_model()
-    loss = AdaptationLoss(toys.POINT, HISTORY, jnp.full(2, ratio))
+    loss = AdaptationLoss(toys.POINT, HISTORY, prior_of(ratio))
     grads = gradient(model, loss, odd_data, moment(0, 4))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))
     taught = [grads.forward_net.hidden, grads.context_encoder]
@@ -179,7 +193,7 @@ def test_held_out_tasks_are_learned_better_after_training_for_it():
     setup = FitSetup(toys.POINT, fitting, HISTORY)
     data = fit_data([of_family(n) for n in range(24)], setup)
     held_out = fit_data([of_family(100 + n) for n in range(12)], setup, data.statistics)
-    loss = AdaptationLoss(toys.POINT, HISTORY, jnp.full(2, 100.0))
+    loss = AdaptationLoss(toys.POINT, HISTORY, prior_of(100.0))
     state = setup.init(MultiHeadDynamics.init(config, toys.POINT, key=jax.random.key(0)))
 
     def epochs(state, count, first, extra=None):

@@ -96,6 +96,11 @@ def _adapts_last_layer(config: Config) -> bool:
     return _is_multi_headed(config) and config.planner.adaptation == "last-layer"
 
 
+def _has_prior(config: Config) -> bool:
+    trained_for = _is_multi_headed(config) and config.fitting.adaptation_epochs > 0
+    return _adapts_last_layer(config) or trained_for
+
+
 def _keeps_variance(config: Config) -> bool:
     return config.planner.warm_variance
 
@@ -142,15 +147,16 @@ _USED_WHEN: tuple[tuple[Callable[[Config], bool], tuple[str, ...]], ...] = (
     (_samples_futures, ("fitting.future_length",)),
     (_selects_by_error, ("planner.selection_error", "planner.selection_skips_newest")),
     (
-        _adapts_last_layer,
+        _has_prior,
         (
             "planner.adaptation_noise",
             "planner.adaptation_prior",
             "planner.adaptation_criterion",
-            "planner.adaptation_variance",
-            "planner.forgetting",
-            "planner.change_threshold",
         ),
+    ),
+    (
+        _adapts_last_layer,
+        ("planner.adaptation_variance", "planner.forgetting", "planner.change_threshold"),
     ),
     (_keeps_variance, ("planner.warm_min_std",)),
     (_has_env_processes, ("collection.step_timeout_s",)),

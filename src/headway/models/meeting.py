@@ -2,17 +2,19 @@
 
 A run goes through its own training loop and knows nothing of the others. Where it comes to a
 function that runs the networks, it waits for them (`jit_networks` brings it here). Calls that
-are alike are stacked along a new leading axis, the seeds, computed by one compiled program, and
-handed back. So a run that ends or fails leaves the others to go on, and one that does something
-else for a while, such as an epoch with a smaller step, is computed by itself.
+are alike are stacked along a new leading axis, the seeds, computed by one compiled program, on a
+CPU a few at a time, and handed back. So a run that ends or fails leaves the others to go on, and
+one that does something else for a while, such as an epoch with a smaller step, is computed by
+itself.
 """
 
 import dataclasses
 import functools
 import threading
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar, Token
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -20,7 +22,10 @@ import jax.numpy as jnp
 
 SEEDS = "seed"
 """Name of the mapped axis."""
+MOST_ON_CPU = 4
+"""Runs that one program computes on a CPU; of more the activations leave the caches."""
 
+Item = TypeVar("Item")
 Position = tuple[int, int]
 """How far a run is: its iteration, and what it does in it; those that are behind go first."""
 
@@ -112,7 +117,8 @@ class Meeting:
     def __init__(self):
         self._changed = threading.Condition()
         self._seats: list[Seat] = []
-        self._stacks = _Stacks()
+        self._stacks: dict[int, _Stacks] = defaultdict(_Stacks)
+        """Of each group, counted within a round: it is mostly of the same runs."""
         self._closed = False
 
     def __enter__(self) -> "Meeting":
@@ -173,8 +179,9 @@ class Meeting:
             call.begun = True
         self._changed.release()
         try:
-            for alike in _by_kind(calls):
-                self._compute_alike(alike)
+            groups = [group for alike in _by_kind(calls) for group in in_groups(alike)]
+            for place, group in enumerate(groups):
+                self._compute_together(group, self._stacks[place])
         except BaseException as error:  # some could not be compared; nobody may wait for them
             for call in calls:
                 if not call.over:
@@ -183,9 +190,9 @@ class Meeting:
             self._changed.acquire()
             self._changed.notify_all()
 
-    def _compute_alike(self, calls: Sequence[Call]) -> None:
+    def _compute_together(self, calls: Sequence[Call], stacks: "_Stacks") -> None:
         try:
-            results = self._results(calls)
+            results = self._results(calls, stacks)
         except BaseException as error:  # each run answers for itself
             for call in calls:
                 call.end(None, error)
@@ -193,17 +200,15 @@ class Meeting:
         for call, result in zip(calls, results, strict=True):
             call.end(result)
 
-    def _results(self, calls: Sequence[Call]) -> Sequence[Any]:
+    def _results(self, calls: Sequence[Call], stacks: "_Stacks") -> Sequence[Any]:
         first = calls[0]
         if len(calls) == 1:
             return [first.program.alone(*first.args, **first.kwargs)]
         columns = zip(*(call.args for call in calls), strict=True)
-        args = tuple(self._stacks.of(column) for column in columns)
-        kwargs = {
-            name: self._stacks.of([call.kwargs[name] for call in calls]) for name in first.kwargs
-        }
+        args = tuple(stacks.of(column) for column in columns)
+        kwargs = {name: stacks.of([call.kwargs[name] for call in calls]) for name in first.kwargs}
         stacked = first.program.together((args, kwargs))
-        return self._stacks.taken_apart(stacked, len(calls))
+        return stacks.taken_apart(stacked, len(calls))
 
 
 def _by_kind(calls: Sequence[Call]) -> list[list[Call]]:
@@ -212,6 +217,14 @@ def _by_kind(calls: Sequence[Call]) -> list[list[Call]]:
     for call in calls:
         groups.setdefault(call.kind, []).append(call)
     return list(groups.values())
+
+
+def in_groups(items: Sequence[Item]) -> list[Sequence[Item]]:
+    """Those that one program computes at once: all, or on a CPU at most `MOST_ON_CPU`."""
+    most = MOST_ON_CPU if jax.default_backend() == "cpu" else len(items)
+    groups = -(-len(items) // most)
+    size = -(-len(items) // groups)
+    return [items[first : first + size] for first in range(0, len(items), size)]
 
 
 class Seat:

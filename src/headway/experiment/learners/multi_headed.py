@@ -89,10 +89,9 @@ class MultiHeaded(Learner):
     def adaptation_loss(
         self, learned: Learned, trajectories: Sequence[Trajectory]
     ) -> AdaptationLoss:
-        """The loss after learning, under the prior that the model of the moment asks for."""
-        likely = PlannerConfig(adaptation_criterion="likelihood")
-        prior = self._prior(learned, trajectories, likely)
-        return AdaptationLoss(self.task, self.config.model.history_length, prior.ratio)
+        """The loss after learning, from the prior that an agent would get at the moment."""
+        prior = self._prior(learned, trajectories, self.config.planner)
+        return AdaptationLoss(self.task, self.config.model.history_length, prior)
 
     def agent(
         self,

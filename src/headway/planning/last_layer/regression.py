@@ -70,6 +70,14 @@ class Prior(NamedTuple):
         shape = jnp.eye(size) if self.shape is None else self.shape.root
         return jnp.sqrt(self.ratio)[:, None, None] * shape
 
+    def even(
+        self, features: Float[Array, "time member feature"]
+    ) -> Float[Array, "time member feature"]:
+        """Rᵀφ: the same information in features whose weights are all equally uncertain."""
+        if self.shape is None:
+            return features
+        return jnp.einsum("tmi,mij->tmj", features, self.shape.root)
+
 
 class Seen(NamedTuple):
     """Transitions as the heads see them, before anything is learned from them."""

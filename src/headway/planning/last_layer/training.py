@@ -74,8 +74,8 @@ class AdaptationLoss(eqx.Module):
 
     task: Task
     history_length: int = eqx.field(static=True)
-    ratio: Float[Array, " member"]
-    """Prior variance of a correction over the variance of the noise (ρ), from `prior`."""
+    prior: Prior
+    """Where heads begin to learn: the one they will act with."""
 
     def __call__(
         self, model: MultiHeadDynamics, data: FitData, key: PRNGKeyArray
@@ -101,7 +101,8 @@ class AdaptationLoss(eqx.Module):
         )
         residual = of_best_heads(seen, learned | judged)
         loss = jax.vmap(loss_after_learning, in_axes=(1, 1, None, None, 0))
-        return loss(seen.features, residual, moment.step, judged, self.ratio)
+        features = self.prior.even(seen.features)
+        return loss(features, residual, moment.step, judged, self.prior.ratio)
 
 
 def with_fixed_heads(model: MultiHeadDynamics) -> MultiHeadDynamics:
