@@ -50,6 +50,11 @@ def test_version_is_the_one_in_pyproject():
     assert headway.__version__ == PROJECT["project"]["version"]
 
 
+def test_the_citation_is_of_this_version():
+    cited = (ROOT / "CITATION.cff").read_text()
+    assert re.search(r"^version: (.+)$", cited, re.MULTILINE)[1] == headway.__version__
+
+
 @pytest.mark.parametrize("name", headway.__all__)
 def test_public_name_resolves_and_is_documented(name):
     value = getattr(headway, name)
