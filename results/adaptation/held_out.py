@@ -64,7 +64,7 @@ def of_moment(
     seen = see_episode(
         model, loss.task, statistics, episodes, moment.episode, context, loss.history_length
     )
-    residual = training.of_best_heads(seen, steps < episodes.length[moment.episode])
+    residual = training.of_best_heads(seen.residual)
 
     def of_rank(features, residual, ratio):
         what = features, residual[:, None]

@@ -15,6 +15,7 @@ from headway.planning.agent import Agent, encode, reset_where
 from headway.planning.imagination import ImaginedDynamics
 from headway.planning.last_layer import learning
 from headway.planning.last_layer.learning import Learned
+from headway.planning.last_layer.prior import fit_prior
 from headway.planning.last_layer.regression import Prior
 from headway.planning.returns import RolloutSettings, candidate_returns
 
@@ -159,9 +160,7 @@ def test_evidence_finds_the_head_that_predicts_and_keeps_it_through_noise():
     sampled = make_agent(head_selection="evidence-sampled", adaptation="none", prior=None)
     evidence = jnp.log(jnp.asarray([[[0.75, 0.25]] * 2] * 2))
     keys = jax.random.split(jax.random.key(0), 400)
-    draw = jax.vmap(
-        lambda key: learning.heads_by_evidence(sampled, evidence, state.recent, key=key)
-    )
+    draw = jax.vmap(lambda key: learning.heads_by_evidence(sampled, evidence, key=key))
     np.testing.assert_allclose(draw(keys).mean(), 0.25, atol=0.04)
 
 
@@ -177,9 +176,24 @@ def test_selection_by_corrected_errors_prefers_what_was_learned():
     assert (errors.sum(-1) < plain.sum(-1)).all()
 
 
-def test_an_agent_needs_a_prior_to_adapt():
+@pytest.mark.parametrize("adaptation", ["none", "last-layer"])
+def test_evidence_speaks_against_a_head_that_errs_absurdly(adaptation):
+    """The gain of the first head is two hundred times too large."""
+    absurd = toys.linear_model([[200.0 * np.eye(2), 0.9 * np.eye(2)]] * 2)
+    agent = make_agent(absurd, head_selection="evidence", adaptation=adaptation)
+    state, decisions = play(agent, 1.0, 8, first_random=8)
+    assert decisions[-1].heads.tolist() == [[1, 1], [1, 1]]
+    if state.learned.layer is not None:
+        assert (np.asarray(state.learned.layer.count) == 7).all()
+
+
+def test_an_agent_needs_a_prior_to_adapt_and_a_prior_needs_episodes():
     with pytest.raises(ConfigError, match="fit_prior"):
         make_agent(prior=None)
+    with pytest.raises(ConfigError, match="no training episodes"):
+        fit_prior(
+            WRONG, toys.POINT, toys.identity_statistics(), [], history_length=3, planner=LAST_LAYER
+        )
 
 
 def test_nothing_is_remembered_where_nothing_keeps_learning():
@@ -220,7 +234,8 @@ def test_the_variance_in_the_plan_is_that_of_the_regression(choices, own):
             phi = np.concatenate([hidden[member, row], rest])
             groups = [choice if own == "heads" else 0 for choice in choices]
             roots = np.asarray(layer.root)[env, member][groups]
-            scale = np.asarray(agent.prior.noise)[member]  # deltas are not scaled here
+            noise = np.asarray(layer.noise(agent.prior))[env, member]  # of this episode
+            scale = noise[choices].mean(0)  # deltas are not scaled here
             added = np.square(phi @ roots).sum() / len(choices) ** 2 * scale
             got = std[member, :, row] ** 2 - frozen[member, :, row] ** 2
             np.testing.assert_allclose(got, added, rtol=2e-3, atol=1e-5)

@@ -11,6 +11,7 @@ from headway.planning.last_layer.regression import (
     LastLayer,
     Observed,
     Prior,
+    Seen,
     Shape,
     forecast,
     forget,
@@ -164,6 +165,46 @@ def test_likelihood_is_that_of_regression_with_unknown_noise(steps):
             )  # fmt: skip
             expected += whole - part
         assert found[env, member, head] == pytest.approx(expected, rel=1e-3, abs=1e-2)
+
+
+def test_transitions_that_cannot_be_true_teach_nothing():
+    """Each of one member's, in one environment, is spoilt in another way."""
+    features, residual, _ = (x[0] for x in some_transitions(1))
+    seen, happened = Seen(features, residual, None), jnp.ones(ENVS, bool)
+    spoilt = {
+        "all heads far off": seen._replace(residual=residual.at[0, 1, :, 0].set(-1e4)),
+        "unknown": seen._replace(residual=residual.at[0, 1].set(jnp.nan)),
+        "huge": seen._replace(features=features.at[0, 1, 2].set(1e5)),
+        "unknown features": seen._replace(features=features.at[0, 1, 2].set(jnp.nan)),
+    }
+    for what, each in spoilt.items():
+        found = Observed.of(each, happened)
+        assert np.asarray(found.learned_from).tolist() == [[1, 0], [1, 1]], what
+        assert not np.asarray(found.features[0, 1]).any()
+        assert not np.asarray(found.residual[0, 1]).any()
+        np.testing.assert_array_equal(found.residual[1], residual[1])
+    not_yet = Observed.of(seen, jnp.asarray([False, True]))
+    assert np.asarray(not_yet.learned_from).tolist() == [[0, 0], [1, 1]]
+
+
+@pytest.mark.parametrize(("value", "taken"), [(1e4, 100.0), (-1e4, -100.0), (np.nan, 100.0)])
+def test_a_head_that_is_absurd_alone_keeps_the_others_from_nothing(value, taken):
+    features, residual, _ = (x[0] for x in some_transitions(1))
+    seen = Seen(features, residual.at[0, 1, 0].set(value), None)
+    found = Observed.of(seen, jnp.ones(ENVS, bool))
+    assert (np.asarray(found.learned_from) == 1).all()
+    np.testing.assert_array_equal(found.residual[0, 1, 1:], residual[0, 1, 1:])
+    assert (np.asarray(found.residual[0, 1, 0]) == taken).all()
+
+
+def test_the_noise_of_heads_is_relative_to_what_they_claim_on_average():
+    features, residual, _ = (x[0] for x in some_transitions(1))
+    logvar = jnp.log(jnp.asarray([1.0, 4.0, 1e9])[:, None] * jnp.asarray([0.5, 2.0]))
+    seen = Seen(features, residual, jnp.broadcast_to(logvar, residual.shape))
+    reference = jnp.log(jnp.asarray([1.0, 2.0]))
+    noise = Observed.of(seen, jnp.ones(ENVS, bool), reference).noise
+    wanted = [[1.0, 4.0, np.exp(7)], [0.5, 2.0, np.exp(7)]]
+    np.testing.assert_allclose(noise, [wanted] * ENVS, rtol=1e-5)
 
 
 def test_what_cannot_be_learned_from_counts_for_nothing():

@@ -80,7 +80,8 @@ class PlannerConfig:
     adaptation_prior: Literal["owner", "runner-up"] = "owner"
     """Which head's residuals on the training episodes are made most likely: those of the head
     that explains an episode best, or second best, as if it were of unseen physics (last-layer).
-    With foresight that decides the noise alone; the rest is chosen by both."""
+    With foresight it decides the noise alone (and, with noise of the heads, what that is relative
+    to); the rest is chosen by both heads."""
     adaptation_criterion: Literal["foresight", "likelihood"] = "foresight"
     """What the prior is chosen by: how well the rest of a training episode is foreseen, one
     horizon ahead, after learning from its beginning; or the likelihood of whole episodes, all

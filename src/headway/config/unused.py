@@ -146,17 +146,15 @@ _USED_WHEN: tuple[tuple[Callable[[Config], bool], tuple[str, ...]], ...] = (
     (_is_recurrent, ("fitting.backprop_steps",)),
     (_samples_futures, ("fitting.future_length",)),
     (_selects_by_error, ("planner.selection_error", "planner.selection_skips_newest")),
-    (
-        _has_prior,
-        (
-            "planner.adaptation_noise",
-            "planner.adaptation_prior",
-            "planner.adaptation_criterion",
-        ),
-    ),
+    (_has_prior, ("planner.adaptation_prior", "planner.adaptation_criterion")),
     (
         _adapts_last_layer,
-        ("planner.adaptation_variance", "planner.forgetting", "planner.change_threshold"),
+        (
+            "planner.adaptation_noise",
+            "planner.adaptation_variance",
+            "planner.forgetting",
+            "planner.change_threshold",
+        ),
     ),
     (_keeps_variance, ("planner.warm_min_std",)),
     (_has_env_processes, ("collection.step_timeout_s",)),

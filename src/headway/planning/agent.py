@@ -192,7 +192,7 @@ def choose_heads(
     """
     layer, log_evidence = (None, None) if learned is None else learned[:2]
     if log_evidence is not None and by_evidence(agent):
-        return heads_by_evidence(agent, log_evidence, recent, key=head_key)
+        return heads_by_evidence(agent, log_evidence, key=head_key)
     slots, used = recent.newest(agent.planner)
     if agent.planner.head_selection == "random":
         used = jnp.zeros_like(used)

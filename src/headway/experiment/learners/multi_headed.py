@@ -89,8 +89,12 @@ class MultiHeaded(Learner):
     def adaptation_loss(
         self, learned: Learned, trajectories: Sequence[Trajectory]
     ) -> AdaptationLoss:
-        """The loss after learning, from the prior that an agent would get at the moment."""
-        prior = self._prior(learned, trajectories, self.config.planner)
+        """The loss after learning, from the prior that an agent would get at the moment.
+
+        The noise of a task is constant in it, whatever `planner.adaptation_noise` says.
+        """
+        planner = dataclasses.replace(self.config.planner, adaptation_noise="constant")
+        prior = self._prior(learned, trajectories, planner)
         return AdaptationLoss(self.task, self.config.model.history_length, prior)
 
     def agent(

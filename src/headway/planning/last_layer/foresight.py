@@ -43,7 +43,7 @@ Foreseen = Iterable[tuple[list[Residuals], list[Residuals]]]
 
 
 class Directions(NamedTuple):
-    """How the features of one member vary: the eigenvectors and eigenvalues Λ, V above."""
+    """How the features of one member vary: the eigenvectors V and eigenvalues Λ above."""
 
     vectors: Float[np.ndarray, "feature feature"]
     values: Float[np.ndarray, " feature"]

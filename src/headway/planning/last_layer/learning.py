@@ -83,11 +83,13 @@ def learn(
         return learned
     newest = recent.obs[:, -1], recent.action[:, -1], recent.next_obs[:, -1]
     seen = Seen.through(agent.model, agent.task, agent.statistics, newest, context)
+    reference = None
+    if agent.prior is not None and agent.planner.adaptation_noise == "heads":
+        reference = agent.prior.log_reference
+    observed = Observed.of(seen, happened, reference)
     if agent.prior is None or learned.layer is None:
-        told = own_log_likelihood(seen)
+        told = own_log_likelihood(observed.residual, seen.logvar)
     else:
-        by_heads = agent.planner.adaptation_noise == "heads"
-        observed = Observed.of(seen, happened, agent.prior.log_reference if by_heads else None)
         layer, suspicion, told = teach(
             agent, agent.prior, observed, learned.layer, learned.suspicion
         )
@@ -95,7 +97,7 @@ def learn(
     if learned.log_evidence is None:
         return learned
     kept = (1.0 - 1.0 / agent.planner.selection_length) * learned.log_evidence
-    counts = happened[:, None, None] & jnp.isfinite(told)
+    counts = (observed.learned_from[..., None] > 0) & jnp.isfinite(told)
     return learned._replace(log_evidence=jnp.where(counts, kept + told, learned.log_evidence))
 
 
@@ -128,15 +130,17 @@ def teach(
     return update(layer, observed, expected), suspicion, likelihood
 
 
-def own_log_likelihood(seen: Seen) -> Float[Array, "env member head"]:
+def own_log_likelihood(
+    residual: Float[Array, "env member head obs"],
+    logvar: Float[Array, "env member head obs"] | None,
+) -> Float[Array, "env member head"]:
     """Log-density of a transition under each head as it was trained, without constants.
 
-    Deterministic heads count as having a variance of 1.
+    Deterministic heads, which have no `logvar`, count as having a variance of 1.
     """
-    squared = jnp.square(seen.residual)
-    if seen.logvar is None:
-        return -0.5 * squared.sum(-1)
-    return -0.5 * (squared * jnp.exp(-seen.logvar) + seen.logvar).sum(-1)
+    if logvar is None:
+        return -0.5 * jnp.square(residual).sum(-1)
+    return -0.5 * (jnp.square(residual) * jnp.exp(-logvar) + logvar).sum(-1)
 
 
 def surprise(
@@ -158,7 +162,6 @@ def surprise(
 def heads_by_evidence(
     agent: "Agent",
     log_evidence: Float[Array, "env member head"],
-    recent: RecentTransitions,
     *,
     key: PRNGKeyArray,
 ) -> Int[Array, "env member"]:
@@ -170,7 +173,8 @@ def heads_by_evidence(
     drawn = jax.random.categorical(key, log_evidence, axis=-1)
     if agent.planner.head_selection == "evidence-sampled":
         return drawn
-    return jnp.where(recent.count[:, None] > 0, log_evidence.argmax(-1), drawn)
+    told = (log_evidence != 0.0).any(-1)
+    return jnp.where(told, log_evidence.argmax(-1), drawn)
 
 
 def corrected_errors(
@@ -199,7 +203,7 @@ def doubt(
     """How uncertain the corrections of the chosen heads are; None if plans need not know.
 
     Several heads are averaged, and what they learned is independent given the features: the
-    variances add up, over the square of their number.
+    variances add up, over the square of their number. They share the mean of their noises.
     """
     if not agent.planner.adaptation_variance or agent.prior is None:
         return None
@@ -212,10 +216,11 @@ def doubt(
         rest = jnp.concatenate([context.transpose(1, 0, 2), rest], axis=-1)
     hidden = root.shape[-2] - rest.shape[-1]
     bias = jnp.einsum("emij,emi->emj", root[..., hidden:, :], rest)
-    scale = jnp.sqrt(agent.prior.noise) * agent.statistics.delta.std
+    noise = [noise_of(layer, agent.prior, heads[..., choice]) for choice in range(choices)]
+    scale = jnp.sqrt(sum(noise) / choices) * agent.statistics.delta.std
     precision = PRECISIONS[agent.planner.precision]
     weight = root[..., :hidden, :].mT.astype(precision)
-    return Doubt(Layer(weight, bias), jnp.broadcast_to(scale, (len(heads), *scale.shape)))
+    return Doubt(Layer(weight, bias), scale)
 
 
 def root_of(
@@ -226,6 +231,14 @@ def root_of(
     return jnp.take_along_axis(layer.root, group, axis=2)[:, :, 0]
 
 
+def noise_of(
+    layer: LastLayer, prior: Prior, head: Int[Array, "env member"]
+) -> Float[Array, "env member obs"]:
+    """Variance of the noise in the episode, of one head of each member."""
+    noise = layer.noise(prior)
+    return jnp.take_along_axis(noise, head[..., None, None], axis=2)[:, :, 0]
+
+
 def correction_variance(
     layer: LastLayer,
     prior: Prior,
@@ -234,4 +247,4 @@ def correction_variance(
 ) -> Float[Array, "env member obs"]:
     """Variance φᵀPφ σ² of what one head of each member adds, in normalised units."""
     projected = jnp.einsum("emij,emi->emj", root_of(layer, head), features)
-    return jnp.square(projected).sum(-1, keepdims=True) * prior.noise
+    return jnp.square(projected).sum(-1, keepdims=True) * noise_of(layer, prior, head)

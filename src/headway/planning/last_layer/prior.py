@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from headway.config import PlannerConfig
 from headway.data import Trajectory
+from headway.errors import ConfigError
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.planning.last_layer import foresight
 from headway.planning.last_layer.evidence import Evidence
@@ -49,7 +50,15 @@ def fit_prior(
         history_length: Past transitions that the context is made of (K).
         planner: Says by what to choose (`adaptation_criterion`), whose residuals are likely
             (`adaptation_prior`), what the noise is like, and how far plans look ahead.
+
+    Raises:
+        ConfigError: There is no episode.
     """
+    if not trajectories:
+        raise ConfigError(
+            "heads that keep learning got no training episodes, allowed: one or more, from which"
+            " their prior is found; pass them, or set planner.adaptation to none."
+        )
     onlooker = Onlooker(model, task, statistics, history_length, planner.adaptation_prior)
     chosen = _evenly_spread(trajectories, MAX_EPISODES)
     # Small matrices, one after the other: BLAS threads only wait for each other, and for long

@@ -29,9 +29,10 @@ from headway.models.dynamics import MultiHeadDynamics, Statistics, network_input
 from headway.tasks.base import Task
 
 BELIEVABLE = 100.0
-"""Deviations of the training data's deltas; heads do not learn from a larger residual."""
+"""Deviations of the training data's deltas; larger residuals of a head count as this large, and
+a transition that no head finds smaller teaches nothing."""
 MAX_FEATURES = 1e8
-"""Squared norm of the features; heads do not learn from larger ones."""
+"""Squared norm of the features; larger ones teach nothing."""
 MAX_LOG_NOISE = 7.0
 """Largest logarithm of the relative noise, either way."""
 NOISE_DOF = 1.0
@@ -52,7 +53,8 @@ class Prior(NamedTuple):
     """What an episode is expected to ask of the heads, per member."""
 
     ratio: Float[Array, " member"]
-    """Prior variance of a weight over the variance of the noise (ρ)."""
+    """Prior variance of a weight over the variance of the noise (ρ); by foresight, all members
+    have the same."""
     noise: Float[Array, "member obs"]
     """Variance of the noise in normalised units (σ²)."""
     log_reference: Float[Array, " member"]
@@ -121,6 +123,22 @@ class Seen(NamedTuple):
         residual = target - mean
         return cls(features, residual.transpose(2, 0, 1, 3), logvar)
 
+    def believed(self, happened: Bool[Array, " env"]) -> "Seen":
+        """What happened and can be true; the rest has features and residuals of zero.
+
+        A head that alone is absurdly wrong keeps its member's other heads from nothing.
+        """
+        size = jnp.square(self.features).sum(-1)
+        credible = (jnp.abs(self.residual) < BELIEVABLE).all(-1).any(-1)
+        true = happened[:, None] & (size < MAX_FEATURES) & credible
+        residual = jnp.nan_to_num(self.residual, nan=BELIEVABLE)
+        residual = jnp.clip(residual, -BELIEVABLE, BELIEVABLE)
+        return Seen(
+            jnp.where(true[..., None], self.features, 0.0),
+            jnp.where(true[..., None, None], residual, 0.0),
+            self.logvar,
+        )
+
 
 def see_episode(
     model: MultiHeadDynamics,
@@ -131,7 +149,7 @@ def see_episode(
     moments: Int[Array, " time"],
     history_length: int,
 ) -> Seen:
-    """All transitions of an episode; what is `env` in `Seen` is time here.
+    """All transitions of an episode that can be true; what is `env` in `Seen` is time here.
 
     Args:
         model: The dynamics model.
@@ -151,7 +169,15 @@ def see_episode(
     context = model.context(history, statistics, told)
     obs = episodes.obs[row]
     transition = obs[:-1], episodes.action[row], obs[1:]
-    return Seen.through(model, task, statistics, transition, context)
+    happened = jnp.arange(len(obs) - 1) < episodes.length[row]
+    return Seen.through(model, task, statistics, transition, context).believed(happened)
+
+
+def heads_by_error(
+    residual: Float[Array, "time member head obs"],
+) -> Int[Array, "member head"]:
+    """Heads in the order in which they explain an episode, by the summed squared error."""
+    return jnp.argsort(jnp.square(residual).sum((0, 3)), axis=-1, stable=True)
 
 
 class Observed(NamedTuple):
@@ -174,27 +200,20 @@ class Observed(NamedTuple):
         happened: Bool[Array, " env"],
         log_reference: Float[Array, " member"] | None = None,
     ) -> "Observed":
-        """Keep what happened and can be true.
-
-        The rest gets features of zero, from which nothing is learned.
+        """Keep what happened and can be true (`Seen.believed`).
 
         Args:
             seen: The transitions.
             happened: Where there was one.
             log_reference: Given if the noise follows the heads' own variance; `Prior` has it.
         """
-        size = jnp.square(seen.features).sum(-1)
-        true = happened[:, None] & (size < MAX_FEATURES)
-        true &= (jnp.abs(seen.residual) < BELIEVABLE).all((-2, -1))
-        noise = jnp.ones((*size.shape, 1))
+        features, residual, _ = seen.believed(happened)
+        true = features[..., -1] > 0
+        noise = jnp.ones((*true.shape, 1))
         if seen.logvar is not None and log_reference is not None:
             relative = seen.logvar.mean(-1) - log_reference[:, None]
             noise = jnp.exp(jnp.clip(relative, -MAX_LOG_NOISE, MAX_LOG_NOISE))
-        return cls(
-            jnp.where(true[..., None], seen.features, 0.0),
-            jnp.where(true[..., None, None], seen.residual, 0.0),
-            jnp.where(true[..., None], noise, 1.0),
-        )
+        return cls(features, residual, jnp.where(true[..., None], noise, 1.0))
 
 
 class LastLayer(NamedTuple):

@@ -11,7 +11,12 @@ from jaxtyping import Array, Float, Int
 
 from headway.data import Episodes, Trajectory
 from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.planning.last_layer.regression import MAX_LOG_NOISE, Seen, see_episode
+from headway.planning.last_layer.regression import (
+    MAX_LOG_NOISE,
+    Seen,
+    heads_by_error,
+    see_episode,
+)
 from headway.tasks.base import Task
 
 Rank = Literal["owner", "runner-up"]
@@ -54,14 +59,13 @@ class Onlooker(NamedTuple):
     def episode(self, trajectory: Trajectory, padded: Episodes) -> list[Residuals]:
         """Each transition with the context of the moment after it, as in acting.
 
-        The heads are those that explain the episode best, or second best, by the summed squared
-        error.
+        The heads are those that explain the episode best, or second best.
         """
         moments = jnp.arange(padded.action.shape[1]) + 1
         seen = self._seen(trajectory, padded, moments)
-        squared = np.square(np.asarray(seen.residual, np.float64)).sum((0, 3))
-        place = min(int(self.rank == "runner-up"), squared.shape[1] - 1)
-        heads = np.argsort(squared, axis=-1, kind="stable")[:, place].tolist()
+        order = heads_by_error(jnp.asarray(seen.residual))
+        place = min(int(self.rank == "runner-up"), order.shape[1] - 1)
+        heads = np.asarray(order[:, place]).tolist()
         return [_of_head(seen, member, head) for member, head in enumerate(heads)]
 
     def from_moments(

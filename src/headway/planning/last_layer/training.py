@@ -13,8 +13,9 @@ judged. Its gradient goes through what was learned into the features.
   but those of training.
 - **Heads are held fixed** in this loss: the ordinary loss goes on beside it and alone decides what
   each head is made for. Else the second-best head would be drawn to the physics of the best.
-- **The noise variance is the most likely one** of each task, head and dimension. So tasks count
-  by how much better they become, not by how large their errors are.
+- **The noise is as large at all transitions** of a task, and its variance the most likely one for
+  each head and dimension. So tasks count by how much better they become, not by how large their
+  errors are.
 
 ALPaCA (Harrison et al., 2018) trains features through the same regression, for one network
 without heads.
@@ -35,8 +36,8 @@ from headway.planning.last_layer.regression import (
     LastLayer,
     Observed,
     Prior,
-    Seen,
     forecast,
+    heads_by_error,
     see_episode,
     update,
 )
@@ -99,7 +100,7 @@ class AdaptationLoss(eqx.Module):
             jnp.where(learned, steps + 1, moment.step),
             self.history_length,
         )
-        residual = of_best_heads(seen, learned | judged)
+        residual = of_best_heads(seen.residual)
         loss = jax.vmap(loss_after_learning, in_axes=(1, 1, None, None, 0))
         features = self.prior.even(seen.features)
         return loss(features, residual, moment.step, judged, self.prior.ratio)
@@ -112,18 +113,11 @@ def with_fixed_heads(model: MultiHeadDynamics) -> MultiHeadDynamics:
 
 
 def of_best_heads(
-    seen: Seen, valid: Bool[Array, " time"], most: int = 2
+    residual: Float[Array, "time member head obs"], most: int = 2
 ) -> Float[Array, "time member rank obs"]:
-    """Residuals of the heads that explain the episode best, by the summed squared error.
-
-    Args:
-        seen: The transitions of the episode.
-        valid: Which of them there are.
-        most: How many heads, if there are so many.
-    """
-    squared = jnp.where(valid[:, None, None, None], jnp.square(seen.residual), 0.0)
-    best = jnp.argsort(squared.sum((0, 3)), axis=-1)[:, :most]
-    return jnp.take_along_axis(seen.residual, best[None, :, :, None], axis=2)
+    """Residuals of the heads that explain the episode best; `most` of them, if there are."""
+    best = heads_by_error(residual)[:, :most]
+    return jnp.take_along_axis(residual, best[None, :, :, None], axis=2)
 
 
 def loss_after_learning(
@@ -139,8 +133,8 @@ def loss_after_learning(
     heads, twice the log-density, without constants. 0 where there is nothing to judge.
 
     Args:
-        features: What the heads see.
-        residual: What they leave unexplained.
+        features: Features whose weights are equally uncertain (`Prior.even`).
+        residual: What the heads leave unexplained.
         learned: How many transitions are learned from (n), from the first one on.
         judged: Transitions to predict then.
         ratio: Of the prior (ρ).
