@@ -139,6 +139,37 @@ def test_changed_physics_are_noticed_and_what_was_learned_is_dropped():
     assert errors[10.0] < 0.5 * errors[0.0]
 
 
+def by_chance(agent, gain, steps, *, state, glitches=()):
+    """Random pushes; at some steps the first environment is moved by something else as well."""
+    rng = np.random.default_rng(3)
+    obs = np.asarray(state.obs)
+    layers = []
+    for step in range(steps):
+        state = state._replace(action=jnp.asarray(rng.uniform(-0.5, 0.5, (2, 2)), jnp.float32))
+        obs = obs + gain * np.asarray(state.action)
+        obs[0] += 3.0 * (step in glitches)
+        state, _ = agent.act(state, obs.astype(np.float32))
+        layers.append(state.learned.layer)
+    return state, layers
+
+
+def test_one_glitch_is_neither_a_change_nor_learned_from_and_blinds_for_none():
+    """Then the physics of the first environment changes, and of the second it does not."""
+    agent = make_agent(change_threshold=20.0)
+    state, _ = play(agent, 1.0, 15, first_random=15)
+    state, (_, before, after, *_) = by_chance(agent, 1.0, 8, state=state, glitches=[2])
+    np.testing.assert_array_equal(after.weight[0], before.weight[0])
+    assert (np.asarray(after.count - before.count) == [[0, 0], [1, 1]]).all()
+    assert (np.asarray(state.learned.suspicion) == 0).all()
+    gains = np.float32([[-0.2], [1.0]])
+    state, layers = by_chance(agent, gains, 12, state=state)
+    counts = np.asarray([layer.count for layer in layers])[..., 0]
+    assert (np.diff(counts[:, 0]) < 0).sum() == 1
+    assert (np.diff(counts[:, 1]) == 1).all()
+    np.testing.assert_allclose(predicted_gain(agent, state)[0], -0.2, atol=0.05)
+    np.testing.assert_allclose(predicted_gain(agent, state)[1], 1.0, atol=0.05)
+
+
 def test_errors_larger_than_in_training_are_not_taken_for_changes():
     """Noise of a hundred times the training data's, throughout the episode."""
     quiet = Prior(jnp.full(2, 10.0), jnp.full((2, 2), 1e-6), jnp.zeros(2))

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 
 Context = Float[Array, "member env context"] | None
 
+CONFIRMATIONS = 3
+"""Surprises, at least, that it takes to believe in changed physics: one or two may be contacts or
+faults of a sensor."""
+
 
 class Learned(NamedTuple):
     """What was learned in the episode of each environment; None where nothing of it is wanted."""
@@ -110,6 +114,9 @@ def teach(
 ) -> tuple[LastLayer, Float[Array, " env"] | None, Float[Array, "env member head"]]:
     """Correct the heads by one transition; what was learned may be forgotten or dropped before.
 
+    A transition that is very surprising waits for others: if they confirm it, the physics has
+    changed and what was learned is dropped; if not, nothing was learned from it.
+
     Returns:
         The corrections, the suspicion that the physics has changed, and the log-likelihood of
         the transition before it was learned from.
@@ -122,10 +129,13 @@ def teach(
     if suspicion is not None:
         anew = untaught(agent, prior, len(suspicion))
         first = happened * log_likelihood(forecast(anew, observed), anew, prior)
-        suspicion = suspicion + surprise(first, likelihood)
+        unexpected = surprise(first, likelihood)
+        most = agent.planner.change_threshold / (CONFIRMATIONS - 0.5)
+        suspicion = suspicion + jnp.minimum(unexpected, most)
         changed = suspicion > agent.planner.change_threshold
         suspicion = jnp.where(changed, 0.0, jnp.maximum(suspicion, 0.0))
         layer = where_env(changed, anew, layer)
+        observed = observed.but_where((unexpected > most) & ~changed)
         expected = forecast(layer, observed)
     return update(layer, observed, expected), suspicion, likelihood
 

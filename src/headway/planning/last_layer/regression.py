@@ -26,6 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from headway.data import Episodes
 from headway.models.dynamics import MultiHeadDynamics, Statistics, network_input
+from headway.planning.optimizers import where_env
 from headway.tasks.base import Task
 
 BELIEVABLE = 100.0
@@ -214,6 +215,11 @@ class Observed(NamedTuple):
             relative = seen.logvar.mean(-1) - log_reference[:, None]
             noise = jnp.exp(jnp.clip(relative, -MAX_LOG_NOISE, MAX_LOG_NOISE))
         return cls(features, residual, jnp.where(true[..., None], noise, 1.0))
+
+    def but_where(self, doubtful: Bool[Array, " env"]) -> "Observed":
+        """The same without what was observed in some environments."""
+        nothing = Observed(*map(jnp.zeros_like, self[:2]), self.noise)
+        return where_env(doubtful, nothing, self)
 
 
 class LastLayer(NamedTuple):
