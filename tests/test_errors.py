@@ -21,6 +21,12 @@ def test_every_error_is_a_headway_error_and_a_builtin_one(kind, builtin):
     assert str(kind("one line")) == "one line"
 
 
+def test_an_unknown_name_where_there_are_none_says_so():
+    assert str(errors.unknown_name("pendulum option", "foo", [])) == (
+        "unknown pendulum option 'foo'. There is none; leave it out."
+    )
+
+
 def test_an_unknown_name_suggests_the_closest_and_lists_all():
     error = errors.unknown_name("environment", "pendulm", ["hopper", "pendulum"])
     assert isinstance(error, errors.UnknownNameError)

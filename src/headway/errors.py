@@ -88,6 +88,8 @@ def unknown_name(kind: str, got: str, allowed: Iterable[str]) -> UnknownNameErro
         An error whose text suggests the closest allowed name.
     """
     names = sorted(allowed)
+    if not names:
+        return UnknownNameError(f"unknown {kind} {shown(got)}. There is none; leave it out.")
     close = difflib.get_close_matches(got[:80], names, n=1, cutoff=0.5)
     hint = f" Did you mean {close[0]!r}?" if close else ""
     return UnknownNameError(f"unknown {kind} {shown(got)}.{hint} Allowed: {', '.join(names[:99])}.")

@@ -170,7 +170,7 @@ def test_three_seeds_of_one_environment_show_no_difference():
     text = verdict("pets", "tmcl", probability_of_improvement(low, high))
     assert text.endswith("; tmcl is above pets in every pair of runs.")
     text = verdict("a", "b", probability_of_improvement([[0.0, 1.0, 2.0]], [[-1.0, -1.0, 0.5]]))
-    assert text.endswith("; a is above b in 89 % of the pairs of runs.")
+    assert text.endswith("; a is above b in 89 % of the pairs of runs and groups.")
     # Groups of one environment are of the same models and add nothing; environments do.
     groups = probability_of_improvement(high * 2, low * 2, envs=["a", "a"])
     assert (groups.p_value, groups.lowest_p) == (0.1, 0.1)

@@ -158,6 +158,8 @@ def test_what_is_asked_twice_or_unknown_is_refused(tmp_path):
         Comparison(experiment("fig13"), twice, (1,), "smoke", tmp_path)
     with pytest.raises(UnknownNameError, match="Did you mean 'fig13'"):
         experiment("figg13")
+    with pytest.raises(UnknownNameError, match="headway plot-dynamics"):
+        experiment("fig8")
 
 
 def test_references_are_arms():

@@ -21,7 +21,12 @@ def read_seeds(words: Sequence[str]) -> tuple[int, ...]:
             raise UsageError(f"--seeds is {word!r}, allowed: whole numbers, or ranges as 0:3.")
         first = int(found[1])
         last = int(found[2]) if found[2] else first + 1
-        if not 0 < last - first <= MAX_SEEDS:
+        if last <= first:
+            raise UsageError(
+                f"--seeds is {word!r}, a range of no seeds, allowed: first:last, where last is the"
+                " larger and left out."
+            )
+        if last - first > MAX_SEEDS:
             raise UsageError(f"--seeds is {word!r}, allowed: 1 to {MAX_SEEDS} seeds.")
         seeds += range(first, last)
     return tuple(seeds)

@@ -308,7 +308,7 @@ def _seen(first: str, second: str, share: float) -> str:
     if share in (0, 1):
         above, below = (first, second) if share else (second, first)
         return f"{above} is above {below} in every pair of runs"
-    return f"{first} is above {second} in {100 * share:.0f} % of the pairs of runs"
+    return f"{first} is above {second} in {100 * share:.0f} % of the pairs of runs and groups"
 
 
 def caution(num_runs: int) -> str:

@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-from headway.errors import ConfigError, shown, unknown_name
+from headway.errors import ConfigError, UnknownNameError, shown, unknown_name
 from headway.experiment.methods import METHODS
 
 Settings = Mapping[str, Any]
@@ -172,6 +172,11 @@ def experiment(name: str) -> Experiment:
     Raises:
         UnknownNameError: No such experiment.
     """
+    if name == "fig8":
+        raise UnknownNameError(
+            "fig8 compares no methods: it shows what an action leads to under different physics;"
+            " `headway plot-dynamics ENV` draws it."
+        )
     if name not in EXPERIMENTS:
         raise unknown_name("experiment", name, EXPERIMENTS)
     return EXPERIMENTS[name]
