@@ -83,6 +83,19 @@ def test_arms_and_changes_of_physics(run_dir, run_script, tmp_path, capsys):
     assert figure.stat().st_size > 10_000
 
 
+def test_returns_of_methods_by_physics(run_script, capsys):
+    folder = SCRIPTS / "pendulum-quick"
+    found = run_script("by_method.py", folder, "--by-physics")
+    header, _, *lines = capsys.readouterr().out.splitlines()
+    assert header.split("|")[3:7] == [" 0.5 ", " 0.75 ", " 1 ", " 1.25 "]
+    rows = [row for path in folder.glob("tmcl-*.csv") for row in read_csv(path, found["COLUMNS"])]
+    longest = [float(row["return_mean"]) for row in rows
+               if row["arm"] == "none" and "1.75" in row["sim_params"]]  # fmt: skip
+    assert len(longest) == 3
+    [line] = [line for line in lines if line.startswith("| `tmcl` | frozen heads |")]
+    assert line.split("|")[-2] == f" {np.mean(longest):.0f} "
+
+
 @pytest.mark.usefixtures("run_script")
 def test_recovery_of_a_pendulum():
     recovery_steps = runpy.run_path(str(SCRIPTS / "changes.py"))["recovery_steps"]

@@ -1,12 +1,15 @@
 """Draw, for every method, the scores of frozen heads and of heads that keep learning.
 
     python results/adaptation/by_method.py results/adaptation/NAME results/adaptation/NAME.png
+    python results/adaptation/by_method.py results/adaptation/NAME --by-physics
 
 The folder holds one table of `measure.py` per run. Methods with two arms are compared. The figure
-has the arms that all of them were tested with; all are printed as a Markdown table.
+has the arms that all of them were tested with; all are printed as a Markdown table. With
+`--by-physics` a table of mean returns is printed instead, with a column for each physics.
 """
 
-import sys
+import argparse
+import json
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from measure import COLUMNS
 
-from headway.report import style
+from headway.report import physics, style
 from headway.storage.records import read_csv
 
 Row = dict[str, str]
@@ -109,9 +112,42 @@ def print_table(training: Scores, unseen: Scores) -> None:
             print(f"| `{method}` |", label(arm), "|", " | ".join(cells), "|")
 
 
-if __name__ == "__main__":
-    folder, output = map(Path, sys.argv[1:])
-    tables = [read_csv(table, COLUMNS) for table in sorted(folder.glob("*.csv"))]
+def print_by_physics(tables: list[list[Row]], methods: list[str]) -> None:
+    """One line per method and arm, with the mean return over runs under each physics."""
+    rows = [row for table in tables for row in table]
+    unseen = {row["sim_params"]: row["group"] != "train" for row in rows}
+    names = physics.varying([json.loads(text) for text in unseen])
+    returns: dict[tuple[str, str, str], list[float]] = {}
+    for row in rows:
+        place = row["method"], row["arm"], row["sim_params"]
+        returns.setdefault(place, []).append(float(row["return_mean"]))
+    heads = [
+        "unseen " * new + physics.value_label(json.loads(text), names)
+        for text, new in unseen.items()
+    ]
+    print("| method | |", " | ".join(heads), "|")
+    print("|---|---" + "|---" * len(heads) + "|")
+    for method, arm in dict.fromkeys((name, arm) for name, arm, _ in returns if name in methods):
+        cells = [f"{np.mean(returns[method, arm, text]):.0f}" for text in unseen]
+        print(f"| `{method}` |", label(arm), "|", " | ".join(cells), "|")
+
+
+def main() -> None:
+    """Print a table; draw the figure."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("folder", type=Path, help="tables of measure.py, one per run")
+    parser.add_argument("figure", type=Path, nargs="?", help="PNG file to write")
+    parser.add_argument("--by-physics", action="store_true", help="returns under each physics")
+    asked = parser.parse_args()
+    tables = [read_csv(table, COLUMNS) for table in sorted(asked.folder.glob("*.csv"))]
     seen, new = scores_of(tables, unseen=False), scores_of(tables, unseen=True)
-    print_table(seen, new)
-    save_figure(seen, new, output, folder.name)
+    if asked.by_physics:
+        print_by_physics(tables, order(new))
+    else:
+        print_table(seen, new)
+    if asked.figure:
+        save_figure(seen, new, asked.figure, asked.folder.name)
+
+
+if __name__ == "__main__":
+    main()
