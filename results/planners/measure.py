@@ -1,9 +1,11 @@
 """Return per FLOP: test one trained run with many planners.
 
     python results/planners/measure.py runs/pendulum --table results/planners/pendulum.csv
+    python results/planners/measure.py runs/pendulum --learning --table results/planners/NAME.csv
 
 Every planner meets the same test episodes. A row is written as soon as it is measured, and what
-the table holds already is skipped, so the same command goes on where it was interrupted.
+the table holds already is skipped, so the same command goes on where it was interrupted. With
+`--learning` heads keep learning while they act, and changes of the physics are watched for.
 """
 
 import argparse
@@ -29,6 +31,7 @@ COLUMNS = (
     "run", "env", "planner", "physics", "settings", "episodes", "score", "return_mean",
     "evaluations_per_step", "flop_per_step", "seconds_per_step", "device",
 )  # fmt: skip
+LEARNING = {"planner.adaptation": "last-layer", "planner.change_threshold": 20.0}
 Settings = dict[str, Any]
 
 
@@ -41,13 +44,16 @@ def planners(own: PlannerConfig, num_members: int) -> dict[str, Settings]:
     """
     paper = size_of(PlannerConfig())
     fast = {"num_candidates": 100, "num_elites": 20, "num_iterations": 3}
+    fast = paper | fast | {"num_particles": num_members}
     some = (own.num_iterations + 1) // 2
     fewer_iterations = {"num_iterations": some}
     warm = {"warm_variance": True}
     return {
         "cem": {},
         "paper": paper,
-        "paper, fast": paper | fast | {"num_particles": num_members},
+        "paper, fast": fast,
+        "paper, fast, icem": fast | {"optimizer": "icem", "num_elites": 10},
+        "paper, fast, mppi": fast | {"optimizer": "mppi"},
         "cem, 1/2 of the candidates": fewer(own, 2),
         "cem, 1/4 of the candidates": fewer(own, 4),
         f"cem, {some} iterations": fewer_iterations,
@@ -124,6 +130,11 @@ def measure(run_dir: Path, settings: Settings, groups: list[str]) -> Settings:
     }
 
 
+def name_of(run: Path) -> str:
+    """The directory's name; of a seed in a sweep, with the method and settings it belongs to."""
+    return f"{run.parent.name}-{run.name}" if run.name.startswith("seed") else run.name
+
+
 def physics_groups(config: Config) -> dict[str, list[str]]:
     """Training physics, and all unseen ones together."""
     train, *unseen = sim_param_sets(config).group_names
@@ -149,6 +160,7 @@ def main() -> None:
     parser.add_argument("run", type=Path, help="directory of a trained run")
     parser.add_argument("--table", type=Path, required=True, help="CSV file to add rows to")
     parser.add_argument("--episodes", type=int, help="per group; the run's own number by default")
+    parser.add_argument("--learning", action="store_true", help="heads learn while they act")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="planners; all by default")
     asked = parser.parse_args()
     config = RunDir(asked.run).config()
@@ -157,14 +169,17 @@ def main() -> None:
         if asked.only and planner not in asked.only:
             continue
         settings = {**chosen, "evaluation.num_episodes": episodes}
+        if asked.learning:
+            settings |= LEARNING
         for physics, groups in physics_groups(config).items():
             rows: list[Mapping[str, Any]] = [*read_csv(asked.table, COLUMNS)]
-            row = {"run": asked.run.name, "planner": planner, "physics": physics}
+            name = planner + ", heads learn" * asked.learning
+            row = {"run": name_of(asked.run), "planner": name, "physics": physics}
             row["settings"] = json.dumps(settings)
             if not already_there(rows, row):
                 row |= measure(asked.run, settings, groups)
                 write_csv(asked.table, COLUMNS, [*rows, row])
-                print(f"{planner}, {physics}: return {row['return_mean']:.1f}", flush=True)
+                print(f"{name}, {physics}: return {row['return_mean']:.1f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -69,8 +69,7 @@ def is_extended(planner: str) -> bool:
 
 def family_of(planner: str) -> str:
     """The optimizer of a planner; the paper's is CEM."""
-    first = planner.partition(",")[0]
-    return first if first in FAMILIES else "cem"
+    return next((word for word in planner.split(", ") if word in FAMILIES), "cem")
 
 
 def numbered(points: dict[str, list[Point]]) -> dict[str, int]:
