@@ -207,6 +207,20 @@ def test_selection_by_corrected_errors_prefers_what_was_learned():
     assert (errors.sum(-1) < plain.sum(-1)).all()
 
 
+def test_evidence_fades_by_what_comes_but_not_by_what_cannot_be_true():
+    agent = make_agent(head_selection="evidence", adaptation="none", prior=None)
+    before, _ = play(agent, -1.0, 4, first_random=4)
+    push = np.asarray(before.action)
+    after, _ = agent.act(before, (np.asarray(before.obs) - push).astype(np.float32))
+    gains = np.asarray([0.4, -1.0]), np.asarray([0.3, -1.0])  # of each member's heads
+    wrong = -1.0 - np.stack(gains)
+    told = -0.5 * np.square(wrong[None, ..., None] * push[:, None, None]).sum(-1)
+    faded = (1 - 1 / 3) * np.asarray(before.learned.log_evidence)
+    np.testing.assert_allclose(after.learned.log_evidence, faded + told, atol=1e-5)
+    spoilt, _ = agent.act(before, np.full((2, 2), 1e6, np.float32))
+    np.testing.assert_array_equal(spoilt.learned.log_evidence, before.learned.log_evidence)
+
+
 @pytest.mark.parametrize("adaptation", ["none", "last-layer"])
 def test_evidence_speaks_against_a_head_that_errs_absurdly(adaptation):
     """The gain of the first head is two hundred times too large."""
