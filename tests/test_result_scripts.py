@@ -96,6 +96,18 @@ def test_returns_of_methods_by_physics(run_script, capsys):
     assert line.split("|")[-2] == f" {np.mean(longest):.0f} "
 
 
+def test_what_runs_earn_while_collecting(run_script, tmp_path, capsys):
+    other = RESULTS / "pendulum-collecting" / "tmcl-bayes" / "seed-0"
+    figure = tmp_path / "collecting.png"
+    run_script("collecting.py", FINISHED, other, "--figure", figure)
+    first, second = capsys.readouterr().out.splitlines()[2:]
+    last = RunDir(other).metrics()[-1]["collection"]["return_mean"]
+    assert second.startswith("| `tmcl-bayes` | 0 | ")
+    assert second.endswith(f" {last:.0f} |")
+    assert first.split("|")[3] == second.split("|")[3]  # both acted at random, with the same seed
+    assert figure.stat().st_size > 10_000
+
+
 @pytest.mark.usefixtures("run_script")
 def test_recovery_of_a_pendulum():
     recovery_steps = runpy.run_path(str(SCRIPTS / "changes.py"))["recovery_steps"]
