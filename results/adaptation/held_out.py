@@ -120,12 +120,19 @@ def main() -> None:
     parser.add_argument("--step", type=float, default=training.STEP, help="share of the step size")
     parser.add_argument("--plain", action="store_true", help="without the adaptation loss")
     parser.add_argument("--episodes", type=int, default=10, help="held out, of each other run")
+    parser.add_argument(
+        "--criterion", default="foresight", choices=["foresight", "likelihood"], help="of the prior"
+    )
     parser.add_argument("--table", type=Path, help="CSV file to write")
     asked = parser.parse_args()
     training.STEP = asked.step
     learners.fit_blocks = plain_fit if asked.plain else _FIT
     run = RunDir(asked.run)
-    config = override(run.config(), {"fitting.adaptation_epochs": asked.epochs})
+    settings = {
+        "fitting.adaptation_epochs": asked.epochs,
+        "planner.adaptation_criterion": asked.criterion,
+    }
+    config = override(run.config(), settings)
     held_out = [
         trajectory
         for other in asked.others
