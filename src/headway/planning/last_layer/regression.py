@@ -218,7 +218,9 @@ class Observed(NamedTuple):
 
     def but_where(self, doubtful: Bool[Array, " env"]) -> "Observed":
         """The same without what was observed in some environments."""
-        nothing = Observed(*map(jnp.zeros_like, self[:2]), self.noise)
+        nothing = self._replace(
+            features=jnp.zeros_like(self.features), residual=jnp.zeros_like(self.residual)
+        )
         return where_env(doubtful, nothing, self)
 
 
