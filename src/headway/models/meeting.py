@@ -23,7 +23,7 @@ import jax.numpy as jnp
 SEEDS = "seed"
 """Name of the mapped axis."""
 MOST_ON_CPU = 4
-"""Runs that one program computes on a CPU; of more the activations leave the caches."""
+"""Runs that one program computes on a CPU; more of them cost more each (docs/performance.md)."""
 
 Item = TypeVar("Item")
 Position = tuple[int, int]
