@@ -53,7 +53,7 @@ def planners(own: PlannerConfig, num_members: int) -> dict[str, Settings]:
         "paper": paper,
         "paper, fast": fast,
         "paper, fast, icem": fast | {"optimizer": "icem", "num_elites": 10},
-        "paper, fast, mppi": fast | {"optimizer": "mppi"},
+        "paper, fast, mppi": without_elites(fast) | {"optimizer": "mppi"},
         "cem, 1/2 of the candidates": fewer(own, 2),
         "cem, 1/4 of the candidates": fewer(own, 4),
         f"cem, {some} iterations": fewer_iterations,
@@ -78,6 +78,11 @@ def size_of(planner: PlannerConfig) -> Settings:
     """What decides how much a plan computes."""
     names = ("horizon", "num_candidates", "num_elites", "num_iterations", "num_particles")
     return {name: getattr(planner, name) for name in names}
+
+
+def without_elites(settings: Settings) -> Settings:
+    """The settings of a planner that ranks no elites."""
+    return {name: value for name, value in settings.items() if name != "num_elites"}
 
 
 def fewer(own: PlannerConfig, share: int) -> Settings:
