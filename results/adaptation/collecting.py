@@ -16,7 +16,6 @@ from matplotlib.ticker import MaxNLocator
 from headway.report import style
 from headway.storage.run_dir import RunDir
 
-COLORS = style.SERIES
 Curves = dict[str, dict[int, list[float]]]
 """Of each method and seed: the mean return of every iteration's episodes."""
 
@@ -51,7 +50,7 @@ def save_figure(curves: Curves, path: Path) -> None:
     title = "What is earned while collecting"
     with style.figure(path, title=title, caption=caption, size=size) as figure:
         axes = figure.subplots()
-        for color, runs in zip(COLORS, curves.values(), strict=False):
+        for color, runs in zip(style.SERIES, curves.values(), strict=False):
             for returns in runs.values():
                 axes.plot(range(1, len(returns) + 1), returns, color=color, lw=0.8, alpha=0.6)
             mean = np.mean([*runs.values()], axis=0)
@@ -60,7 +59,7 @@ def save_figure(curves: Curves, path: Path) -> None:
         style.label_axis(axes, "iteration", "return")
         handles = [
             Line2D([], [], color=color, marker="o", label=method)
-            for color, method in zip(COLORS, curves, strict=False)
+            for color, method in zip(style.SERIES, curves, strict=False)
         ]
         style.legend(figure, handles)
 
