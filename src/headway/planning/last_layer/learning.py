@@ -13,6 +13,7 @@ from headway.planning.last_layer.regression import (
     Observed,
     Prior,
     Seen,
+    credence,
     forecast,
     forget,
     log_likelihood,
@@ -114,8 +115,8 @@ def teach(
 ) -> tuple[LastLayer, Float[Array, " env"] | None, Float[Array, "env member head"]]:
     """Correct the heads by one transition; what was learned may be forgotten or dropped before.
 
-    A transition that is very surprising waits for others: if they confirm it, the physics has
-    changed and what was learned is dropped; if not, nothing was learned from it.
+    A very surprising transition counts the less, the more it surprises. If others confirm it,
+    the physics has changed and what was learned is dropped.
 
     Returns:
         The corrections, the suspicion that the physics has changed, and the log-likelihood of
@@ -135,7 +136,10 @@ def teach(
         changed = suspicion > agent.planner.change_threshold
         suspicion = jnp.where(changed, 0.0, jnp.maximum(suspicion, 0.0))
         layer = where_env(changed, anew, layer)
-        observed = observed.but_where((unexpected > most) & ~changed)
+        expected = forecast(layer, observed)
+        doubtful = ((unexpected > most) & ~changed)[:, None, None]
+        spread = expected.spread / credence(expected, layer, prior)
+        observed = observed.noisier(jnp.where(doubtful, spread - expected.spread, 0.0))
         expected = forecast(layer, observed)
     return update(layer, observed, expected), suspicion, likelihood
 

@@ -26,7 +26,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from headway.data import Episodes
 from headway.models.dynamics import MultiHeadDynamics, Statistics, network_input
-from headway.planning.optimizers import where_env
 from headway.tasks.base import Task
 
 BELIEVABLE = 100.0
@@ -216,12 +215,9 @@ class Observed(NamedTuple):
             noise = jnp.exp(jnp.clip(relative, -MAX_LOG_NOISE, MAX_LOG_NOISE))
         return cls(features, residual, jnp.where(true[..., None], noise, 1.0))
 
-    def but_where(self, doubtful: Bool[Array, " env"]) -> "Observed":
-        """The same without what was observed in some environments."""
-        nothing = self._replace(
-            features=jnp.zeros_like(self.features), residual=jnp.zeros_like(self.residual)
-        )
-        return where_env(doubtful, nothing, self)
+    def noisier(self, more: Float[Array, "env member group"]) -> "Observed":
+        """The same with more noise, so that it counts for less."""
+        return self._replace(noise=self.noise + more)
 
 
 class LastLayer(NamedTuple):
@@ -322,6 +318,28 @@ def forget(state: LastLayer, prior: Prior, share: float) -> LastLayer:
     root = prior.root(size)[:, None] @ jnp.linalg.cholesky(mixed)
     kept = 1.0 - share
     return LastLayer(kept**0.5 * state.weight, root, kept * state.squares, kept * state.count)
+
+
+def credence(
+    expected: Forecast, state: LastLayer, prior: Prior
+) -> Float[Array, "env member group"]:
+    """How much a transition is believed, in (0, 1], if rare errors may be of any size.
+
+    The weight of an observation under the t-distribution of `log_likelihood`, as in robust
+    filters (Agamennoni, Nieto and Nebot, 2011); 1 up to one standard deviation. Heads that share
+    their noise believe what the best of them does.
+
+    Args:
+        expected: What was foreseen, and how it differs.
+        state: What was known before the transition.
+        prior: Where the episode began.
+    """
+    dof = (NOISE_DOF + state.count)[..., None]
+    var = jnp.maximum(expected.spread[..., None] * state.noise(prior), TINY)
+    error = (jnp.square(expected.innovation) / var).mean(-1)
+    if expected.spread.shape[-1] == 1:
+        error = error.min(-1, keepdims=True)
+    return jnp.minimum((dof + 1.0) / (dof + error), 1.0)
 
 
 def log_likelihood(
