@@ -1,4 +1,9 @@
-"""Checks every shape annotation of the core in all tests, and sets up Hypothesis."""
+"""Checks every shape annotation of the core in all tests, and sets up Hypothesis and XLA."""
+
+import os
+
+# Most of the time goes to compiling small programs that run once: LLVM need not optimise them.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 import jaxtyping
 
