@@ -31,6 +31,7 @@ RULES = (
     ("models/networks.py", "Dense.__call__", ACTIVATION),
     ("models/networks.py", "bound_logvar", SAMPLING),
     ("planning/imagination.py", "Layer.__call__", ACTIVATION),
+    ("planning/imagination.py", "rounded", ACTIVATION),
     ("planning/imagination.py", "fold", BEFORE),
     ("planning/imagination.py", "", SAMPLING),
     ("planning/returns.py", "", ROLLOUT),

@@ -12,7 +12,7 @@ import toys
 from headway.models.dynamics import GaussianNet, MultiHeadDynamics, network_input
 from headway.models.networks import DenseHeads
 from headway.planning import returns
-from headway.planning.imagination import ImaginedDynamics
+from headway.planning.imagination import ImaginedDynamics, rounded
 from headway.planning.returns import RolloutSettings, candidate_returns
 
 KEY = jax.random.key(0)
@@ -240,3 +240,18 @@ def test_folded_model_equals_the_unfolded_one(which, with_context):
                 rtol=1e-3,
                 atol=2e-4,
             )
+
+
+def test_numbers_are_rounded_to_the_nearest_bfloat16_and_halves_away_from_zero():
+    rng = np.random.default_rng(0)
+    some = rng.normal(size=10_000) * 10.0 ** rng.uniform(-38, 38, 10_000)
+    special = np.asarray([0.0, -0.0, np.inf, -np.inf, np.nan, 3.4e38, 1e-40], np.float32)
+    x = np.concatenate([some.astype(np.float32), special])
+    x = jnp.asarray(x[x.view(np.uint32) % 2**16 != 2**15])  # not between two of them
+    found = rounded(x, jnp.bfloat16)
+    assert found.dtype == jnp.bfloat16
+    expected = x.astype(jnp.bfloat16).astype(jnp.float32)
+    np.testing.assert_array_equal(found.astype(jnp.float32), expected)
+    np.testing.assert_array_equal(rounded(x, jnp.float32), x)
+    half = jnp.asarray([1 + 2**-8, -1 - 2**-8, 1 + 3 * 2**-8], jnp.float32)
+    assert rounded(half, jnp.bfloat16).tolist() == [1 + 2**-7, -1 - 2**-7, 1 + 2**-6]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, DTypeLike, Float, Int
 
 from headway.models.dynamics import GaussianNet, MultiHeadDynamics, Statistics
 from headway.models.networks import Dense, DenseHeads, bound_logvar, swish
@@ -34,10 +34,21 @@ class Layer(NamedTuple):
         product = jnp.einsum(
             "moi,mipc->mopc",
             self.weight,
-            x.astype(self.weight.dtype),
+            rounded(x, self.weight.dtype),
             preferred_element_type=jnp.float32,
         )
         return product + self.bias[:, :, None, None]
+
+
+def rounded(x: Float[Array, "*shape"], dtype: DTypeLike) -> Float[Array, "*shape"]:
+    """`x` in a precision of `PRECISIONS`, to the nearest; of two equally near, the larger in size.
+
+    On CPUs XLA's own conversion to bfloat16 halves the vectors of whatever it is fused with.
+    """
+    if dtype != jnp.bfloat16 or jax.default_backend() != "cpu":
+        return x.astype(dtype)
+    bits = jax.lax.bitcast_convert_type(x, jnp.uint32) + jnp.uint32(2**15)
+    return jax.lax.bitcast_convert_type((bits >> 16).astype(jnp.uint16), jnp.bfloat16)
 
 
 class ChosenHeads(NamedTuple):
