@@ -13,6 +13,7 @@ from headway.planning.last_layer.regression import (
     Prior,
     Seen,
     Shape,
+    credence,
     forecast,
     forget,
     log_likelihood,
@@ -165,6 +166,28 @@ def test_likelihood_is_that_of_regression_with_unknown_noise(steps):
             )  # fmt: skip
             expected += whole - part
         assert found[env, member, head] == pytest.approx(expected, rel=1e-3, abs=1e-2)
+
+
+@pytest.mark.parametrize("groups", [1, HEADS])
+def test_a_transition_is_believed_as_the_slope_of_its_likelihood_says(groups):
+    """A Gaussian error x pulls by x / var; under Student's t it pulls by a share of that."""
+    prior, transitions = some_prior(shaped=True), some_transitions(9, groups)
+    before, last = (jax.tree.map(lambda x, part=part: x[part], transitions)
+                    for part in (slice(8), 8))  # fmt: skip
+    state = learn_all(fresh(prior, groups), before)
+    expected = forecast(state, last)
+    var = expected.spread[..., None] * state.noise(prior)
+    errors = jnp.asarray([1.5, 4.0, 60.0])[:HEADS, None]  # in deviations, alike in all dimensions
+    expected = expected._replace(innovation=errors * jnp.sqrt(var))
+    slope = jax.grad(
+        lambda x: log_likelihood(expected._replace(innovation=x), state, prior).sum()
+    )(expected.innovation)
+    share = np.asarray(-slope * var / expected.innovation)[..., 0]
+    if groups == 1:
+        share = share.max(-1, keepdims=True)
+    np.testing.assert_allclose(credence(expected, state, prior), share, rtol=1e-4)
+    near = expected._replace(innovation=0.9 * jnp.sqrt(var))
+    np.testing.assert_array_equal(credence(near, state, prior), 1.0)
 
 
 def test_transitions_that_cannot_be_true_teach_nothing():

@@ -339,7 +339,7 @@ def credence(
     error = (jnp.square(expected.innovation) / var).mean(-1)
     if expected.spread.shape[-1] == 1:
         error = error.min(-1, keepdims=True)
-    return jnp.minimum((dof + 1.0) / (dof + error), 1.0)
+    return jnp.clip((dof + 1.0) / (dof + error), TINY, 1.0)
 
 
 def log_likelihood(
