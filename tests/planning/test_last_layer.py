@@ -179,9 +179,9 @@ def test_a_transition_is_believed_as_the_slope_of_its_likelihood_says(groups):
     var = expected.spread[..., None] * state.noise(prior)
     errors = jnp.asarray([1.5, 4.0, 60.0])[:HEADS, None]  # in deviations, alike in all dimensions
     expected = expected._replace(innovation=errors * jnp.sqrt(var))
-    slope = jax.grad(
-        lambda x: log_likelihood(expected._replace(innovation=x), state, prior).sum()
-    )(expected.innovation)
+    slope = jax.grad(lambda x: log_likelihood(expected._replace(innovation=x), state, prior).sum())(
+        expected.innovation
+    )
     share = np.asarray(-slope * var / expected.innovation)[..., 0]
     if groups == 1:
         share = share.max(-1, keepdims=True)
