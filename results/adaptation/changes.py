@@ -29,7 +29,6 @@ from headway.data import Trajectory
 from headway.experiment.loading import load_agent
 from headway.experiment.methods import config_to_evaluate
 from headway.experiment.rollouts import AgentPolicy, Arena, Episode, run_episodes
-from headway.planning.last_layer import learning
 from headway.storage.records import read_csv, write_csv
 from headway.storage.run_dir import RunDir
 
@@ -166,11 +165,7 @@ def main() -> None:
     parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
     parser.add_argument("--step", type=int, default=100, help="before which the physics changes")
     parser.add_argument("--episodes", type=int, default=1, help="per change")
-    parser.add_argument(
-        "--confirmations", type=int, default=learning.CONFIRMATIONS, help="surprises to a change"
-    )
     asked = parser.parse_args()
-    learning.CONFIRMATIONS = asked.confirmations
     for run in asked.runs:
         table = asked.folder / f"{name_of(run)}.csv"
         heads = RunDir(run).config().model.kind == "multi-headed"
