@@ -10,6 +10,8 @@ from typing import Any
 
 import jax
 
+from headway.cpus import num_cpus
+
 PACKAGES = ("headway", "jax", "jaxlib", "numpy", "equinox", "mujoco", "gymnasium")
 
 
@@ -17,10 +19,10 @@ def facts() -> dict[str, Any]:
     """Date, device, processor and versions, as they stand at the top of every result."""
     return {
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "kind": machine_kind(jax.default_backend(), jax.devices()[0].device_kind, num_cores()),
+        "kind": machine_kind(jax.default_backend(), jax.devices()[0].device_kind, num_cpus()),
         "device": f"{jax.devices()[0].device_kind} ({jax.default_backend()})",
         "processor": processor_name(),
-        "cores": num_cores(),
+        "cores": num_cpus(),
         "load_at_end": round(os.getloadavg()[0], 2),
         "python": platform.python_version(),
         **{name: importlib.metadata.version(name) for name in PACKAGES},
@@ -40,13 +42,6 @@ def machine_kind(backend: str, device: str, cores: int) -> str:
     words = re.split(r"[^a-z0-9]+", device.lower())
     dull = re.compile(r"nvidia|geforce|amd|tesla|\d+gb|hbm\w*|pcie|sxm\d*|")
     return "-".join(word for word in words if not dull.fullmatch(word)) or backend
-
-
-def num_cores() -> int:
-    """Processor cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def processor_name() -> str:

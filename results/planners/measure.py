@@ -6,6 +6,7 @@
 Every planner meets the same test episodes. A row is written as soon as it is measured, and what
 the table holds already is skipped, so the same command goes on where it was interrupted. With
 `--learning` heads keep learning while they act, and changes of the physics are watched for.
+`--precision bfloat16` plans faster where the processor multiplies in bfloat16.
 """
 
 import argparse
@@ -32,6 +33,7 @@ COLUMNS = (
     "evaluations_per_step", "flop_per_step", "seconds_per_step", "device",
 )  # fmt: skip
 LEARNING = {"planner.adaptation": "last-layer", "planner.change_threshold": 20.0}
+COLORS_OF_NOISE = (0.25, 0.5, 1.0)
 Settings = dict[str, Any]
 
 
@@ -54,6 +56,7 @@ def planners(own: PlannerConfig, num_members: int) -> dict[str, Settings]:
         "paper, fast": fast,
         "paper, fast, icem": fast | {"optimizer": "icem", "num_elites": 10},
         "paper, fast, mppi": without_elites(fast) | {"optimizer": "mppi"},
+        **by_color(fast),
         "cem, 1/2 of the candidates": fewer(own, 2),
         "cem, 1/4 of the candidates": fewer(own, 4),
         f"cem, {some} iterations": fewer_iterations,
@@ -72,6 +75,17 @@ def planners(own: PlannerConfig, num_members: int) -> dict[str, Settings]:
         "mppi, 1/4 of the candidates": mppi(own, 4),
         "random-shooting": {"optimizer": "random-shooting"},
     }
+
+
+def by_color(fast: Settings) -> dict[str, Settings]:
+    """iCEM and MPPI with noise of several colours, from nearly white to red (theirs)."""
+    found = {}
+    for beta in COLORS_OF_NOISE:
+        colored = {"noise_beta": beta, "optimizer": "icem", "num_elites": 10}
+        found[f"paper, fast, icem, beta {beta}"] = fast | colored
+        colored = {"noise_beta": beta, "optimizer": "mppi"}
+        found[f"paper, fast, mppi, beta {beta}"] = without_elites(fast) | colored
+    return found
 
 
 def size_of(planner: PlannerConfig) -> Settings:
@@ -166,7 +180,9 @@ def main() -> None:
     parser.add_argument("--table", type=Path, required=True, help="CSV file to add rows to")
     parser.add_argument("--episodes", type=int, help="per group; the run's own number by default")
     parser.add_argument("--learning", action="store_true", help="heads learn while they act")
+    parser.add_argument("--precision", help="of every planner's products; the run's by default")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="planners; all by default")
+    parser.add_argument("--training", action="store_true", help="on training physics only")
     asked = parser.parse_args()
     config = RunDir(asked.run).config()
     episodes = asked.episodes or config.evaluation.num_episodes
@@ -174,9 +190,13 @@ def main() -> None:
         if asked.only and planner not in asked.only:
             continue
         settings = {**chosen, "evaluation.num_episodes": episodes}
+        if asked.precision:
+            settings["planner.precision"] = asked.precision
         if asked.learning:
             settings |= LEARNING
         for physics, groups in physics_groups(config).items():
+            if asked.training and physics != "training":
+                continue
             rows: list[Mapping[str, Any]] = [*read_csv(asked.table, COLUMNS)]
             name = planner + ", heads learn" * asked.learning
             row = {"run": name_of(asked.run), "planner": name, "physics": physics}

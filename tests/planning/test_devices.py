@@ -62,18 +62,83 @@ print(len(state.search.guess.sharding.device_set))
 
 @pytest.mark.parametrize("settings", [{}, {"particle_noise": "shared"}, {"num_candidates": 42}])
 def test_four_devices_choose_the_actions_of_one(settings):
-    worker = python(PROGRAM, "4", json.dumps(settings))
+    (one, num_one), (four, num_four) = (on_devices(number, settings) for number in (1, 4))
+    assert (num_one, num_four) == (1, 4)
+    np.testing.assert_allclose(four, one, atol=1e-5)
+
+
+def on_devices(number, settings):
+    """The actions of an agent on some simulated devices, and how many its state lies on."""
+    worker = python(PROGRAM, str(number), json.dumps(settings))
     out, errors = worker.communicate()
     assert worker.returncode == 0, errors[-2000:]
     found, num_devices = out.splitlines()[-2:]
-    shared = settings.get("num_candidates", 40) % 4 == 0
-    assert int(num_devices) == (4 if shared else 1)
-    four = np.array(json.loads(found))
-    np.testing.assert_allclose(four, actions(make_agent(**settings)), atol=1e-5)
+    return np.array(json.loads(found)), int(num_devices)
+
+
+COMPILED_PROGRAM = """
+import jax
+jax.config.update("jax_num_cpu_devices", 2)
+from planning import test_devices
+compiled = []
+def listen(event, seconds, **rest):
+    compiled.append(event) if event.endswith("backend_compile_duration") else None
+jax.monitoring.register_event_duration_secs_listener(listen)
+agent = test_devices.make_agent()
+state, _ = agent.act(agent.init(1, key=jax.random.key(0)), [[0.0, 0.0]])
+print(len(compiled) > 0)
+compiled.clear()
+for _ in range(3):
+    state, _ = agent.act(state, [[0.0, 0.0]])
+print(len(compiled))
+"""
+
+
+def test_devices_that_share_a_plan_compile_it_once():
+    worker = python(COMPILED_PROGRAM)
+    out, errors = worker.communicate()
+    assert worker.returncode == 0, errors[-2000:]
+    assert out.split() == ["True", "0"]
+
+
+THREADS_PROGRAM = """
+import threading, jax
+jax.config.update("jax_num_cpu_devices", 2)
+from planning import test_devices
+agents = [test_devices.make_agent(smoothing=smoothing) for smoothing in (0.1, 0.2, 0.3)]
+threads = [
+    threading.Thread(target=test_devices.actions, args=(agent, 2, 100)) for agent in agents
+]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+print("done")
+"""
+
+
+def test_agents_in_threads_can_share_devices_at_once():
+    worker = python(THREADS_PROGRAM)
+    try:
+        out, errors = worker.communicate(timeout=120)
+    finally:
+        worker.kill()
+    assert out.split() == ["done"], errors[-2000:]
+
+
+@pytest.mark.parametrize(
+    ("environment", "number"),
+    [({"NPROC": "3"}, 3), ({"NPROC": "30"}, 8), ({"JAX_NUM_CPU_DEVICES": "1", "NPROC": "3"}, 1)],
+)
+def test_every_cpu_is_a_device_unless_the_user_says_otherwise(monkeypatch, environment, number):
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    worker = python("import headway, jax; headway.Agent; print(len(jax.devices()))")
+    out, errors = worker.communicate()
+    assert out.split() == [str(number)], errors[-2000:]
 
 
 SHARED_PROGRAM = """
 import json, sys, jax
+jax.config.update("jax_num_cpu_devices", 1)
 jax.config.update("jax_cpu_collectives_implementation", "gloo")
 jax.distributed.initialize(sys.argv[1], num_processes=2, process_id=int(sys.argv[2]))
 from planning import test_devices
@@ -120,10 +185,16 @@ def test_reduced_precision_chooses_nearly_the_same_actions():
 
 def test_environments_are_spread_evenly_over_chunks_that_fit(monkeypatch):
     monkeypatch.setattr(devices, "activation_budget", lambda: 100)
-    assert devices.environments_at_once(10, 10) == 10
-    assert devices.environments_at_once(10, 11) == 5
-    assert devices.environments_at_once(10, 30) == 3
-    assert devices.environments_at_once(10, 1000) == 1
+    assert devices.AtOnce.of(10, 2, 5) == (10, 2)
+    assert devices.AtOnce.of(10, 1, 11) == (5, 1)
+    assert devices.AtOnce.of(10, 3, 10) == (3, 3)
+    assert devices.AtOnce.of(10, 5, 20) == (1, 5)
+
+
+def test_members_go_one_by_one_where_they_do_not_fit_together(monkeypatch):
+    monkeypatch.setattr(devices, "activation_budget", lambda: 100)
+    assert devices.AtOnce.of(10, 5, 21) == (1, 1)
+    assert devices.AtOnce.of(1, 2, 1000) == (1, 1)
 
 
 def test_the_budget_of_a_gpu_follows_its_free_memory():

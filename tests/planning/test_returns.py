@@ -10,9 +10,9 @@ import pytest
 
 import toys
 from headway.models.dynamics import GaussianNet, MultiHeadDynamics, network_input
-from headway.models.networks import DenseHeads
-from headway.planning import returns
-from headway.planning.imagination import ImaginedDynamics, rounded
+from headway.models.networks import DenseHeads, bound_logvar
+from headway.planning.devices import AtOnce
+from headway.planning.imagination import ImaginedDynamics, bounded_var, rounded
 from headway.planning.returns import RolloutSettings, candidate_returns
 
 KEY = jax.random.key(0)
@@ -174,8 +174,44 @@ def test_environments_in_chunks_have_the_same_returns_as_side_by_side(at_once, m
     context = jnp.asarray(rng.normal(size=(2, 5, 3)), jnp.float32)
     dynamics = fold(model, heads, context=context)
     whole = returns_of(dynamics, obs, candidates)
-    monkeypatch.setattr(returns, "environments_at_once", lambda *_: at_once)
+    monkeypatch.setattr(AtOnce, "of", lambda *_: AtOnce(at_once, 2))
     np.testing.assert_allclose(returns_of(dynamics, obs, candidates), whole, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"shared_noise": True}, {"risk_aversion": 0.5}, {"released_reward": True}]
+)
+def test_members_one_by_one_have_the_same_returns_as_side_by_side(settings, monkeypatch):
+    rng = np.random.default_rng(5)
+    obs = rng.normal(size=(3, 2)).astype(np.float32)
+    candidates = rng.uniform(-1, 1, (3, 6, 4, 2)).astype(np.float32)
+    heads = rng.integers(0, 2, (3, 2, 1))
+    context = jnp.asarray(rng.normal(size=(2, 3, 3)), jnp.float32)
+    dynamics, task = fold(toys.small_model(), heads, context=context), CornerTask()
+    whole = returns_of(dynamics, obs, candidates, task, **settings)
+    other_noise = returns_of(dynamics, obs, candidates, task, key=jax.random.key(9), **settings)
+    assert not np.allclose(whole, other_noise, rtol=1e-3)
+    monkeypatch.setattr(AtOnce, "of", lambda *_: AtOnce(1, 1))
+    alone = returns_of(dynamics, obs, candidates, task, **settings)
+    np.testing.assert_allclose(alone, whole, rtol=1e-5)
+
+
+def test_on_other_devices_than_cpus_the_same_noise_is_drawn_step_by_step(monkeypatch):
+    candidates = np.zeros((1, 3, 4, 2), np.float32)
+    dynamics = random_walk_dynamics(0.2)
+    before = returns_of(dynamics, np.zeros((1, 2)), candidates)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    np.testing.assert_allclose(
+        returns_of(dynamics, np.zeros((1, 2)), candidates), before, rtol=1e-5
+    )
+
+
+def test_the_variance_of_a_plan_is_that_of_bounded_log_variances():
+    logvar = jnp.asarray([-300.0, -80.0, -12.0, -3.0, 0.4, 5.0, 80.0, 300.0])
+    for bounds in ((-10.0, 0.5), (-40.0, 20.0), (-2.0, -1.5)):
+        expected = jnp.exp(bound_logvar(logvar, *map(jnp.float32, bounds)))
+        found = bounded_var(logvar, *map(jnp.float32, bounds))
+        np.testing.assert_allclose(found, expected, rtol=2e-5)
 
 
 def test_an_environments_returns_do_not_depend_on_its_neighbours():

@@ -8,8 +8,9 @@ import mujoco.rollout
 import numpy as np
 from jaxtyping import Bool, Float
 
+from headway.cpus import num_cpus
 from headway.envs.robots import RobotState
-from headway.envs.vector_worlds import RolloutVectorEnv, num_cpus
+from headway.envs.vector_worlds import RolloutVectorEnv
 
 _PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
 _CONTROL = mujoco.mjtState.mjSTATE_CTRL.value

@@ -3,7 +3,6 @@
 
 """Vector environments of the built-in worlds: NumPy for the classic ones, MuJoCo's rollout."""
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -12,6 +11,7 @@ import mujoco.rollout
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
+from headway.cpus import num_cpus
 from headway.envs.classic import ClassicWorld
 from headway.envs.robots import Robot, RobotState
 from headway.envs.vector import Outcome, WorldVectorEnv
@@ -192,10 +192,3 @@ class RolloutVectorEnv(WorldVectorEnv):
             self._pool.shutdown()
         for rollout in self._rollouts:
             rollout.close()
-
-
-def num_cpus() -> int:
-    """CPUs that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

@@ -23,6 +23,7 @@ from headway.errors import ConfigError
 from headway.experiment.rollouts import Arena
 from headway.planning.acting import Decision, Physics
 from headway.planning.controller import env_action
+from headway.planning.devices import Devices, brought_to_each, whole_on_each
 from headway.planning.imagination import over_rows
 from headway.planning.optimizers import Plan, SearchState, make_optimizer
 from headway.planning.step import scoring
@@ -116,6 +117,7 @@ class ClassicSimulator:
     def __init__(self, vector: ClassicVectorEnv, task: Task, planner: PlannerConfig):
         self.task = task
         self._vector = vector
+        self._devices: Devices = planner.devices
         self._plan = jax.jit(functools.partial(_plan, vector.world, task, planner))
 
     def plan(self, search: SearchState, key: PRNGKeyArray) -> Plan:
@@ -125,6 +127,7 @@ class ClassicSimulator:
             name: jnp.asarray(values, jnp.float32)
             for name, values in self._vector.sim_params.items()
         }
+        search, key = brought_to_each((search, key), self._devices)
         return self._plan(states, sim_params, search, key)
 
 
@@ -140,7 +143,8 @@ def _plan(
     dynamics = ClassicDynamics(states, sim_params, world)
     obs = world.observe(states, jnp)
     score = scoring(task, planner, dynamics, obs)
-    return make_optimizer(planner).optimize(score, search, key=key)
+    plan = make_optimizer(planner).optimize(score, search, key=key)
+    return whole_on_each(plan, planner.devices)
 
 
 class ClassicDynamics(eqx.Module):

@@ -14,7 +14,6 @@ from headway.data import sim_params_row
 from headway.errors import ConfigError
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.planning.acting import Decision
-from headway.planning.devices import whole_on_each
 from headway.planning.heads import RecentTransitions, head_errors, select_heads
 from headway.planning.imagination import ImaginedDynamics
 from headway.planning.last_layer.learning import (
@@ -148,8 +147,7 @@ class Agent(eqx.Module):
         acted = jnp.ones_like(state.acted)
         search = make_optimizer(self.planner).shift(plan.state)
         state = AgentState(recent, obs, action, acted, search, key, learned, state.sim_params)
-        decision = Decision(action, heads, plan.failures, plan.evaluations)
-        return whole_on_each((state, decision), self.planner.devices)
+        return state, Decision(action, heads, plan.failures, plan.evaluations)
 
 
 class Prepared(NamedTuple):

@@ -17,6 +17,7 @@ from headway.models.dynamics import Statistics
 from headway.planning.acting import Acting
 from headway.planning.checking import RangeCheck, in_bounds, not_finite, one_row
 from headway.planning.deadline import DeadlinePlanner
+from headway.planning.devices import brought_to_each
 from headway.planning.step import Planning, hold
 from headway.tasks.base import Task
 
@@ -255,7 +256,8 @@ class Controller:
     def _hold(self, reason: str, started: float) -> Float[np.ndarray, " action"]:
         """The next action of the last plan."""
         self._count(True, reason)
-        self._state = _held(self._planner, self._state)
+        planner: Any = self._planner  # there is a plan to hold to
+        self._state = _held(planner, brought_to_each(self._state, planner.devices))
         scaled = jax.device_get(self._state.action[0])
         self._status = Status("held", reason, (), 0, time.perf_counter() - started)
         return env_action(self.agent.task, scaled)

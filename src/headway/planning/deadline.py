@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from headway.errors import ConfigError
 from headway.models.compilation import jit_networks
 from headway.planning.acting import Decision
+from headway.planning.devices import brought_to_each, whole_on_each
 from headway.planning.optimizers import make_optimizer
 from headway.planning.step import Planning, scoring
 
@@ -91,6 +92,7 @@ class DeadlinePlanner:
         """
         until = started + self._seconds
         begin, seen = self._compiled["begin"], jnp.asarray(obs)
+        state = brought_to_each(state, self._agent.planner.devices)
         prepared, keys, search = jax.block_until_ready(begin(self._agent, state, seen))
         done, settled = 0, False
         while done < self._optimizer.num_iterations and not settled:
@@ -130,7 +132,8 @@ def _begin(
     prepared = agent.prepare(state, obs)
     optimizer = make_optimizer(agent.planner)
     keys = jax.random.split(prepared.plan_key, optimizer.num_iterations)
-    return prepared, list(keys), optimizer.begin(state.search)
+    begun = prepared, list(keys), optimizer.begin(state.search)
+    return whole_on_each(begun, agent.planner.devices)
 
 
 def _iterate(
@@ -144,14 +147,14 @@ def _iterate(
     optimizer = make_optimizer(agent.planner)
     score = scoring(agent.task, agent.planner, prepared.dynamics, obs)
     search = optimizer.iterate(score, search, key, iteration)
-    return search, optimizer.settled(search)
+    return whole_on_each((search, optimizer.settled(search)), agent.planner.devices)
 
 
 def _end(
     agent: Planning, state: Any, obs: Float[Array, "env obs"], prepared: Any, search: Any
 ) -> tuple[Any, Decision]:
     plan = make_optimizer(agent.planner).end(search)
-    return agent.decide(state, obs, prepared, plan)
+    return whole_on_each(agent.decide(state, obs, prepared, plan), agent.planner.devices)
 
 
 _COMPILED = {

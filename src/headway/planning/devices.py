@@ -3,7 +3,7 @@
 Decided when a plan is compiled. None of it changes a result beyond rounding.
 """
 
-from typing import Literal, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -15,25 +15,34 @@ from headway.models.meeting import seeds_at_once
 Tree = TypeVar("Tree")
 Devices = Literal["local", "all"]
 
-CPU_BUDGET = 4 * 2**20
+CPU_BUDGET = 2**20
 """Bytes that one array of activations may take on a CPU: more would leave its caches."""
 ARRAYS = 8
 """How many such arrays a plan holds at most; the share of free GPU memory that one may take."""
 
 
-def environments_at_once(num_envs: int, bytes_per_env: int) -> int:
-    """How many environments are imagined side by side, so that memory stays bounded.
+class AtOnce(NamedTuple):
+    """How much is imagined side by side, so that memory stays bounded and caches suffice."""
 
-    Args:
-        num_envs: Environments in all.
-        bytes_per_env: Size of one environment's widest array of activations, for one seed.
+    envs: int
+    members: int
+    """All of them, or 1: where not all fit, one by one is faster on a CPU."""
 
-    Returns:
-        At least 1; the environments are spread evenly over the fewest chunks that fit.
-    """
-    fitting = max(1, activation_budget() // (bytes_per_env * seeds_at_once()))
-    chunks = -(-num_envs // fitting)
-    return -(-num_envs // chunks)
+    @classmethod
+    def of(cls, num_envs: int, num_members: int, bytes_per_member: int) -> "AtOnce":
+        """As much as fits the budget, at least one member of one environment.
+
+        Args:
+            num_envs: Environments in all; they are spread evenly over the fewest chunks that fit.
+            num_members: Networks of each.
+            bytes_per_member: Size of the widest array of activations of one member of one
+                environment, for one seed.
+        """
+        fitting = activation_budget() // (bytes_per_member * seeds_at_once())
+        if fitting < num_members:
+            return cls(1, 1)
+        chunks = -(-num_envs // (fitting // num_members))
+        return cls(-(-num_envs // chunks), num_members)
 
 
 def activation_budget() -> int:
@@ -43,27 +52,48 @@ def activation_budget() -> int:
 
 
 def spread_candidates(x: Array, devices: Devices = "local") -> Array:
-    """Share the last axis, the candidates, among devices, where it can be divided.
+    """Share the last axis, the candidates, among devices.
 
     Args:
         x: Any array whose last axis is the candidates.
         devices: Those of this process, or of all processes together.
     """
     mesh = _mesh(devices)
-    if mesh.size == 1 or x.shape[-1] % mesh.size:
+    if mesh.size == 1:
         return x
     spec = PartitionSpec(*[PartitionSpec.UNCONSTRAINED] * (x.ndim - 1), "candidate")
     return jax.lax.with_sharding_constraint(x, NamedSharding(mesh, spec))
 
 
 def whole_on_each(tree: Tree, devices: Devices) -> Tree:
-    """Give every device all of some arrays, where several processes share a plan.
+    """Give every device all of some arrays that a compiled step returns.
 
-    So each process can read them.
+    So each process can read them, and they can be the next step's arguments as they are.
     """
-    if devices == "local" or jax.process_count() == 1:
+    everywhere = _everywhere(devices)
+    if everywhere.mesh.size == 1:
         return tree
-    return jax.lax.with_sharding_constraint(tree, NamedSharding(_mesh(devices), PartitionSpec()))
+    return jax.lax.with_sharding_constraint(tree, everywhere)
+
+
+def brought_to_each(tree: Tree, devices: Devices) -> Tree:
+    """What a compiled step remembers, where `whole_on_each` leaves it, also before the first step.
+
+    So the second step does not have to be compiled again for arrays that lie elsewhere.
+    """
+    everywhere = _everywhere(devices)
+    if everywhere.mesh.size == 1 or devices != "local":
+        return tree
+    return jax.tree.map(
+        lambda x: (
+            x if getattr(x, "sharding", None) == everywhere else jax.device_put(x, everywhere)
+        ),
+        tree,
+    )
+
+
+def _everywhere(devices: Devices) -> NamedSharding:
+    return NamedSharding(_mesh(devices), PartitionSpec())
 
 
 def _mesh(devices: Devices) -> Mesh:

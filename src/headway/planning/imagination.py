@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, DTypeLike, Float, Int
 
 from headway.models.dynamics import GaussianNet, MultiHeadDynamics, Statistics
-from headway.models.networks import Dense, DenseHeads, bound_logvar, swish
+from headway.models.networks import Dense, DenseHeads, swish
 from headway.tasks.base import Task
 
 Correction = Float[Array, "env member head feature obs"]
@@ -159,6 +159,13 @@ class ImaginedDynamics(eqx.Module):
             hidden[self.context_layer] = layer._replace(bias=part.context_bias)
         return ImaginedDynamics(tuple(hidden), part, self.delta_std, self.context_layer)
 
+    def of_member(self, member: Int[Array, ""]) -> "ImaginedDynamics":
+        """See `Ensemble.of_member`."""
+        hidden, heads = jax.tree.map(
+            lambda x: jax.lax.dynamic_slice_in_dim(x, member, 1), (self.hidden, self.heads)
+        )
+        return ImaginedDynamics(hidden, heads, self.delta_std, self.context_layer)
+
     @property
     def widest(self) -> int:
         """See `Dynamics.widest`."""
@@ -225,11 +232,15 @@ class ImaginedDynamics(eqx.Module):
         """Standard deviation of the average of the choices' samples, in raw units."""
         members, choices, obs_size = low.shape
         logvar = logvar.reshape(members, choices, obs_size, *logvar.shape[2:])
-        bounded = bound_logvar(logvar, low[..., None, None], high[..., None, None])
-        scale = self.delta_std[:, None, None]
-        if choices == 1:
-            return jnp.exp(0.5 * bounded[:, 0]) * scale
-        return jnp.sqrt(jnp.exp(bounded).sum(1)) * (scale / choices)
+        var = bounded_var(logvar, low[..., None, None], high[..., None, None])
+        return jnp.sqrt(var.sum(1)) * (self.delta_std / choices)[:, None, None]
+
+
+def bounded_var(
+    logvar: Float[Array, "..."], low: Float[Array, "..."], high: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """`exp(bound_logvar(...))`, in which all logarithms cancel: one exponential instead of five."""
+    return jnp.exp(low) + 1.0 / (jnp.exp(-high) + jnp.exp(-logvar))
 
 
 def plan_layers(layers: Sequence[Dense], precision: str) -> tuple[Layer, ...]:

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from headway.config import PlannerConfig
 from headway.models.compilation import jit_networks
 from headway.planning.acting import Acting, Decision
+from headway.planning.devices import brought_to_each, whole_on_each
 from headway.planning.optimizers import Plan, Score, SearchState, make_optimizer
 from headway.planning.returns import Dynamics, RolloutSettings, candidate_returns
 from headway.tasks.base import Task
@@ -74,6 +75,7 @@ def scoring(
 def act(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[Any, Decision]:
     """One whole step, compiled."""
     compiled = _act_bfloat16 if agent.planner.precision == "bfloat16" else _act_float32
+    state = brought_to_each(state, agent.planner.devices)
     return compiled(agent, state, jnp.asarray(obs, jnp.float32))
 
 
@@ -83,7 +85,7 @@ def _act(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[Any
     score = scoring(agent.task, agent.planner, prepared.dynamics, obs)
     optimizer = make_optimizer(agent.planner)
     plan = optimizer.optimize(score, state.search, key=prepared.plan_key)
-    return agent.decide(state, obs, prepared, plan)
+    return whole_on_each(agent.decide(state, obs, prepared, plan), agent.planner.devices)
 
 
 _act_float32 = jit_networks(_act)
@@ -102,4 +104,5 @@ def hold(planner: PlannerConfig, state: Any) -> Any:
     """
     search = make_optimizer(planner).shift(state.search)
     unseen = jnp.zeros_like(state.acted)
-    return state._replace(action=state.search.guess[:, 0], acted=unseen, search=search)
+    held = state._replace(action=state.search.guess[:, 0], acted=unseen, search=search)
+    return whole_on_each(held, planner.devices)
