@@ -25,6 +25,7 @@ OTHER = "other"
 # (file, function, part): the first line whose texts occur in a frame decides.
 RULES = (
     ("headway/tasks/", "", TASK),
+    ("planning/noise.py", "", NOISE),
     ("headway/", "noise", NOISE),
     ("headway/", "draw", NOISE),
     ("models/networks.py", "swish", ACTIVATION),

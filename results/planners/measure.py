@@ -33,7 +33,7 @@ COLUMNS = (
     "evaluations_per_step", "flop_per_step", "seconds_per_step", "device",
 )  # fmt: skip
 LEARNING = {"planner.adaptation": "last-layer", "planner.change_threshold": 20.0}
-COLORS_OF_NOISE = (0.25, 0.5, 1.0)
+COLORS_OF_NOISE = (0.25, 0.5, 1.0, 2.0)
 Settings = dict[str, Any]
 
 
@@ -47,15 +47,15 @@ def planners(own: PlannerConfig, num_members: int) -> dict[str, Settings]:
     paper = size_of(PlannerConfig())
     fast = {"num_candidates": 100, "num_elites": 20, "num_iterations": 3}
     fast = paper | fast | {"num_particles": num_members}
+    preset = fast | {"num_elites": 10, "optimizer": "icem", "noise_beta": 0.25}
     some = (own.num_iterations + 1) // 2
     fewer_iterations = {"num_iterations": some}
     warm = {"warm_variance": True}
     return {
         "cem": {},
         "paper": paper,
-        "paper, fast": fast,
-        "paper, fast, icem": fast | {"optimizer": "icem", "num_elites": 10},
-        "paper, fast, mppi": without_elites(fast) | {"optimizer": "mppi"},
+        "fast": preset,
+        "fast, cem": fast,
         **by_color(fast),
         "cem, 1/2 of the candidates": fewer(own, 2),
         "cem, 1/4 of the candidates": fewer(own, 4),
@@ -78,13 +78,13 @@ def planners(own: PlannerConfig, num_members: int) -> dict[str, Settings]:
 
 
 def by_color(fast: Settings) -> dict[str, Settings]:
-    """iCEM and MPPI with noise of several colours, from nearly white to red (theirs)."""
+    """iCEM and MPPI with noise of several colours, from nearly white to red (their default)."""
     found = {}
     for beta in COLORS_OF_NOISE:
-        colored = {"noise_beta": beta, "optimizer": "icem", "num_elites": 10}
-        found[f"paper, fast, icem, beta {beta}"] = fast | colored
-        colored = {"noise_beta": beta, "optimizer": "mppi"}
-        found[f"paper, fast, mppi, beta {beta}"] = without_elites(fast) | colored
+        colored = {"optimizer": "icem", "num_elites": 10, "noise_beta": beta}
+        found[f"fast, icem, beta {beta}"] = fast | colored
+        colored = {"optimizer": "mppi", "noise_beta": beta}
+        found[f"fast, mppi, beta {beta}"] = without_elites(fast) | colored
     return found
 
 

@@ -10,9 +10,9 @@ import pytest
 
 import toys
 from headway.models.dynamics import GaussianNet, MultiHeadDynamics, network_input
-from headway.models.networks import DenseHeads, bound_logvar
+from headway.models.networks import DenseHeads, bound_logvar, swish
 from headway.planning.devices import AtOnce
-from headway.planning.imagination import ImaginedDynamics, bounded_var, rounded
+from headway.planning.imagination import ImaginedDynamics, bounded_var, rough_swish, rounded
 from headway.planning.returns import RolloutSettings, candidate_returns
 
 KEY = jax.random.key(0)
@@ -203,6 +203,18 @@ def test_on_other_devices_than_cpus_the_same_noise_is_drawn_step_by_step(monkeyp
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     np.testing.assert_allclose(
         returns_of(dynamics, np.zeros((1, 2)), candidates), before, rtol=1e-5
+    )
+
+
+def test_the_rough_activation_is_within_a_tenth_of_what_bfloat16_loses():
+    x = jnp.linspace(-40.0, 40.0, 100_001)
+    error = jnp.abs(rough_swish(x) - swish(x))
+    assert 1e-5 < error.max() < 2e-4
+    above = x > 1
+    lost = jnp.abs(swish(x).astype(jnp.bfloat16).astype(jnp.float32) - swish(x))
+    assert error[above].mean() < 0.1 * lost[above].mean()
+    np.testing.assert_allclose(
+        rough_swish(jnp.asarray([1e30, jnp.inf])), [1e30, jnp.inf], rtol=1e-4
     )
 
 

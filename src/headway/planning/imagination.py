@@ -51,6 +51,20 @@ def rounded(x: Float[Array, "*shape"], dtype: DTypeLike) -> Float[Array, "*shape
     return jax.lax.bitcast_convert_type((bits >> 16).astype(jnp.uint16), jnp.bfloat16)
 
 
+def rough_swish(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """`swish` to within 2e-4, a tenth of what rounding to bfloat16 takes from a number near 1.
+
+    Its tanh is a quotient of polynomials of lower degree than XLA's, fitted to the least
+    largest error of swish.
+    """
+    half = 0.5 * x
+    bounded = jnp.clip(half, -5.4, 5.4)
+    square = jnp.square(bounded)
+    above = 0.998925793 + square * (0.098016076 + square * 5.71165459e-4)
+    below = 1.0 + square * (0.429472208 + square * 0.0116753473)
+    return half + half * (bounded * above / below)
+
+
 class ChosenHeads(NamedTuple):
     """What one plan has of each environment's own: its heads, and the context in a hidden layer.
 
@@ -208,8 +222,9 @@ class ImaginedDynamics(eqx.Module):
             x: Raw features, then actions in [-1, 1].
             noise: Standard normal draws.
         """
+        reduced = self.heads.layer.weight.dtype == jnp.bfloat16
         for layer in self.hidden:
-            x = swish(layer(x))
+            x = rough_swish(layer(x)) if reduced else swish(layer(x))
         out = self.heads.layer(x)
         obs_size = self.delta_std.shape[0]
         mean = out[:, :obs_size]
