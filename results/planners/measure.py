@@ -78,7 +78,7 @@ def planners(own: PlannerConfig, num_members: int) -> dict[str, Settings]:
 
 
 def by_color(fast: Settings) -> dict[str, Settings]:
-    """iCEM and MPPI with noise of several colours, from nearly white to red (their default)."""
+    """The planners iCEM and MPPI with noise of several colours, from nearly white to red."""
     found = {}
     for beta in COLORS_OF_NOISE:
         colored = {"optimizer": "icem", "num_elites": 10, "noise_beta": beta}

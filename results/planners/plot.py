@@ -3,6 +3,7 @@
 python results/planners/plot.py results/planners/pendulum.csv results/planners/pendulum.png
 """
 
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,6 +26,8 @@ class Point(NamedTuple):
     """One planner on one kind of physics: means over runs."""
 
     planner: str
+    family: str
+    """Its optimizer."""
     flop: float
     seconds: float
     values: tuple[float, ...]
@@ -49,7 +52,9 @@ def read_points(path: Path) -> tuple[dict[str, list[Point]], str]:
                 float(np.mean([float(row[name] or "nan") for row in same]))
                 for name in ("flop_per_step", "seconds_per_step")
             )
-            found.append(Point(planner, flop, seconds, tuple(float(r[column]) for r in same)))
+            family = json.loads(same[0]["settings"]).get("planner.optimizer", "cem")
+            values = tuple(float(row[column]) for row in same)
+            found.append(Point(planner, family, flop, seconds, values))
     return points, column.partition("_")[0]
 
 
@@ -67,11 +72,6 @@ def is_extended(planner: str) -> bool:
     return "warm" in planner or "settle" in planner
 
 
-def family_of(planner: str) -> str:
-    """The optimizer of a planner; the paper's is CEM."""
-    return next((word for word in planner.split(", ") if word in FAMILIES), "cem")
-
-
 def numbered(points: dict[str, list[Point]]) -> dict[str, int]:
     """A number for every planner, by rising cost."""
     everything = [point for found in points.values() for point in found]
@@ -83,7 +83,7 @@ def numbered(points: dict[str, list[Point]]) -> dict[str, int]:
 def draw(axes: Axes, points: Sequence[Point], numbers: dict[str, int]) -> None:
     """One panel: every planner with its number, its range over runs, and the Pareto line."""
     for point in points:
-        family = family_of(point.planner)
+        family = point.family
         gflop = point.flop / 1e9
         fill = "none" if is_extended(point.planner) else "full"
         look = {"color": COLORS[family], "fillstyle": fill, "markersize": 5}
@@ -130,8 +130,8 @@ def save_figure(points: dict[str, list[Point]], value: str, path: Path, source: 
             draw(axes, found, numbers)
             axes.set_title(f"{physics} physics")
             style.label_axis(axes, "GFLOP per step", value)
-        shown = [point.planner for found in points.values() for point in found]
-        there = {family_of(planner) for planner in shown}
+        everything = [point for found in points.values() for point in found]
+        shown, there = [p.planner for p in everything], {p.family for p in everything}
         looks = [(name, FAMILIES[name], COLORS[name], "full") for name in FAMILIES if name in there]
         if any(map(is_extended, shown)):
             looks.insert(1, ("cem, warm or settling", FAMILIES["cem"], COLORS["cem"], "none"))

@@ -31,6 +31,13 @@ def test_every_planner_of_the_comparison_is_another_valid_one(scripts, method, p
     assert {planner.optimizer for planner in found} == {"cem", "icem", "mppi", "random-shooting"}
 
 
+def test_the_planner_called_fast_is_that_of_the_preset(scripts):
+    measure, _ = scripts
+    paper, fast = (make_config("hopper", preset=preset) for preset in ("paper", "fast"))
+    settings = measure.distinct(paper)["fast"]
+    assert config_to_evaluate(paper, settings).planner == fast.planner
+
+
 def test_a_measured_planner_is_skipped_and_a_changed_one_refused(scripts):
     measure, _ = scripts
     row = {"run": "a", "planner": "cem", "physics": "training", "settings": "{}"}
@@ -50,5 +57,5 @@ def test_the_pareto_line_leaves_out_what_a_cheaper_planner_equals(scripts):
         "e": (5, 0.9),
         "f": (1, 0.1),
     }
-    points = [plot.Point(name, flop, 0.0, (value,)) for name, (flop, value) in costs.items()]
+    points = [plot.Point(name, "cem", flop, 0.0, (value,)) for name, (flop, value) in costs.items()]
     assert [point.planner for point in plot.pareto(points)] == ["a", "b", "e"]

@@ -196,14 +196,16 @@ def test_members_one_by_one_have_the_same_returns_as_side_by_side(settings, monk
     np.testing.assert_allclose(alone, whole, rtol=1e-5)
 
 
-def test_on_other_devices_than_cpus_the_same_noise_is_drawn_step_by_step(monkeypatch):
+@pytest.mark.parametrize("members", [1, 2])
+def test_on_other_devices_than_cpus_the_same_noise_is_drawn_step_by_step(members, monkeypatch):
     candidates = np.zeros((1, 3, 4, 2), np.float32)
-    dynamics = random_walk_dynamics(0.2)
+    dynamics = fold(toys.small_model(), np.zeros((1, 2, 1), int), context=jnp.ones((2, 1, 3)))
     before = returns_of(dynamics, np.zeros((1, 2)), candidates)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    np.testing.assert_allclose(
-        returns_of(dynamics, np.zeros((1, 2)), candidates), before, rtol=1e-5
-    )
+    monkeypatch.setattr(AtOnce, "of", lambda *_: AtOnce(1, members))
+    found = returns_of(dynamics, np.zeros((1, 2)), candidates)
+    np.testing.assert_allclose(found, before, rtol=1e-5)
+    assert len(set(found[0].tolist())) == 3
 
 
 def test_the_rough_activation_is_within_a_tenth_of_what_bfloat16_loses():

@@ -222,8 +222,8 @@ class _Imagined(NamedTuple):
             obs, alive, total, memory = carry
             scaled, noise = step
             scaled = spread(jnp.broadcast_to(scaled[:, None], (members, action_size, *rows[1:])))
-            drawn = self._noise(noise, rows)
-            memory, next_obs = dynamics.step(task, memory, obs, scaled, drawn)
+            noise = self._drawn(noise, member)
+            memory, next_obs = dynamics.step(task, memory, obs, scaled, noise)
             action = scale_action(scaled)
             total = total + jnp.where(alive, reward_of(obs, action, next_obs), 0.0)
             alive = alive & ~terminated(obs, action, next_obs)
@@ -255,16 +255,23 @@ class _Imagined(NamedTuple):
         keys = jax.random.split(self.key, horizon)
         if jax.default_backend() != "cpu":
             return keys
-        shape = *shape, len(self.candidates)
-        return self._spread(jax.vmap(lambda key: normal(key, shape, member))(keys))
+        return self._spread(jax.vmap(lambda key: self._draw(key, member))(keys))
 
-    def _noise(
-        self, step: Array | None, rows: tuple[int, ...]
+    def _drawn(
+        self, step: Array | None, member: Int[Array, ""] | None
     ) -> Float[Array, "member obs particle #candidate"] | None:
-        """The noise of one step."""
+        """The noise of one step, drawn now if it is not yet."""
         if step is None or jnp.issubdtype(step.dtype, jnp.floating):
             return step
-        return self._spread(jax.random.normal(step, (rows[0], self.obs.shape[0], *rows[1:])))
+        return self._spread(self._draw(step, member))
+
+    def _draw(
+        self, key: PRNGKeyArray, member: Int[Array, ""] | None
+    ) -> Float[Array, "member obs particle candidate"]:
+        """One step's own noise for every candidate; that of one member is as it is with all."""
+        particles, candidates = self.settings.particles_per_member, len(self.candidates)
+        shape = self.dynamics.num_members, self.obs.shape[0], particles, candidates
+        return normal(key, shape, member)
 
     def _spread(self, x: Array) -> Array:
         return spread_candidates(x, self.settings.devices)
