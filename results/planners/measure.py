@@ -47,15 +47,13 @@ def planners(own: PlannerConfig, num_members: int) -> dict[str, Settings]:
     paper = size_of(PlannerConfig())
     fast = {"num_candidates": 100, "num_elites": 20, "num_iterations": 3}
     fast = paper | fast | {"num_particles": num_members}
-    preset = fast | {"num_elites": 10, "optimizer": "icem", "noise_beta": 0.25}
     some = (own.num_iterations + 1) // 2
     fewer_iterations = {"num_iterations": some}
     warm = {"warm_variance": True}
     return {
         "cem": {},
         "paper": paper,
-        "fast": preset,
-        "fast, cem": fast,
+        "fast": fast,
         **by_color(fast),
         "cem, 1/2 of the candidates": fewer(own, 2),
         "cem, 1/4 of the candidates": fewer(own, 4),
@@ -203,7 +201,7 @@ def main() -> None:
             row["settings"] = json.dumps(settings)
             if not already_there(rows, row):
                 row |= measure(asked.run, settings, groups)
-                write_csv(asked.table, COLUMNS, [*rows, row])
+                write_csv(asked.table, COLUMNS, [*read_csv(asked.table, COLUMNS), row])
                 print(f"{name}, {physics}: return {row['return_mean']:.1f}", flush=True)
 
 

@@ -192,7 +192,7 @@ def test_memory_is_shared_by_the_seeds(monkeypatch):
     found = []
 
     def look(x):
-        found.append((seeds_at_once(), devices.AtOnce.of(6, 1, 100).envs))
+        found.append((seeds_at_once(), devices.environments_at_once(6, 100)))
         return x
 
     program = Program(look, dict)

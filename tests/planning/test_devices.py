@@ -101,41 +101,6 @@ def test_devices_that_share_a_plan_compile_it_once():
     assert out.split() == ["True", "0"]
 
 
-THREADS_PROGRAM = """
-import threading, jax
-jax.config.update("jax_num_cpu_devices", 2)
-from planning import test_devices
-agents = [test_devices.make_agent(smoothing=smoothing) for smoothing in (0.1, 0.2, 0.3)]
-threads = [
-    threading.Thread(target=test_devices.actions, args=(agent, 2, 100)) for agent in agents
-]
-for thread in threads: thread.start()
-for thread in threads: thread.join()
-print("done")
-"""
-
-
-def test_agents_in_threads_can_share_devices_at_once():
-    worker = python(THREADS_PROGRAM)
-    try:
-        out, errors = worker.communicate(timeout=120)
-    finally:
-        worker.kill()
-    assert out.split() == ["done"], errors[-2000:]
-
-
-@pytest.mark.parametrize(
-    ("environment", "number"),
-    [({"NPROC": "3"}, 3), ({"NPROC": "30"}, 8), ({"JAX_NUM_CPU_DEVICES": "1", "NPROC": "3"}, 1)],
-)
-def test_every_cpu_is_a_device_unless_the_user_says_otherwise(monkeypatch, environment, number):
-    for name, value in environment.items():
-        monkeypatch.setenv(name, value)
-    worker = python("import headway, jax; headway.Agent; print(len(jax.devices()))")
-    out, errors = worker.communicate()
-    assert out.split() == [str(number)], errors[-2000:]
-
-
 SHARED_PROGRAM = """
 import json, sys, jax
 jax.config.update("jax_num_cpu_devices", 1)
@@ -185,16 +150,10 @@ def test_reduced_precision_chooses_nearly_the_same_actions():
 
 def test_environments_are_spread_evenly_over_chunks_that_fit(monkeypatch):
     monkeypatch.setattr(devices, "activation_budget", lambda: 100)
-    assert devices.AtOnce.of(10, 2, 5) == (10, 2)
-    assert devices.AtOnce.of(10, 1, 11) == (5, 1)
-    assert devices.AtOnce.of(10, 3, 10) == (3, 3)
-    assert devices.AtOnce.of(10, 5, 20) == (1, 5)
-
-
-def test_members_go_one_by_one_where_they_do_not_fit_together(monkeypatch):
-    monkeypatch.setattr(devices, "activation_budget", lambda: 100)
-    assert devices.AtOnce.of(10, 5, 21) == (1, 1)
-    assert devices.AtOnce.of(1, 2, 1000) == (1, 1)
+    assert devices.environments_at_once(10, 10) == 10
+    assert devices.environments_at_once(10, 11) == 5
+    assert devices.environments_at_once(10, 30) == 3
+    assert devices.environments_at_once(10, 1000) == 1
 
 
 def test_the_budget_of_a_gpu_follows_its_free_memory():

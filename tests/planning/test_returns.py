@@ -11,7 +11,7 @@ import pytest
 import toys
 from headway.models.dynamics import GaussianNet, MultiHeadDynamics, network_input
 from headway.models.networks import DenseHeads, bound_logvar, swish
-from headway.planning.devices import AtOnce
+from headway.planning import returns
 from headway.planning.imagination import ImaginedDynamics, bounded_var, rough_swish, rounded
 from headway.planning.returns import RolloutSettings, candidate_returns
 
@@ -174,35 +174,15 @@ def test_environments_in_chunks_have_the_same_returns_as_side_by_side(at_once, m
     context = jnp.asarray(rng.normal(size=(2, 5, 3)), jnp.float32)
     dynamics = fold(model, heads, context=context)
     whole = returns_of(dynamics, obs, candidates)
-    monkeypatch.setattr(AtOnce, "of", lambda *_: AtOnce(at_once, 2))
+    monkeypatch.setattr(returns, "environments_at_once", lambda *_: at_once)
     np.testing.assert_allclose(returns_of(dynamics, obs, candidates), whole, rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "settings", [{}, {"shared_noise": True}, {"risk_aversion": 0.5}, {"released_reward": True}]
-)
-def test_members_one_by_one_have_the_same_returns_as_side_by_side(settings, monkeypatch):
-    rng = np.random.default_rng(5)
-    obs = rng.normal(size=(3, 2)).astype(np.float32)
-    candidates = rng.uniform(-1, 1, (3, 6, 4, 2)).astype(np.float32)
-    heads = rng.integers(0, 2, (3, 2, 1))
-    context = jnp.asarray(rng.normal(size=(2, 3, 3)), jnp.float32)
-    dynamics, task = fold(toys.small_model(), heads, context=context), CornerTask()
-    whole = returns_of(dynamics, obs, candidates, task, **settings)
-    other_noise = returns_of(dynamics, obs, candidates, task, key=jax.random.key(9), **settings)
-    assert not np.allclose(whole, other_noise, rtol=1e-3)
-    monkeypatch.setattr(AtOnce, "of", lambda *_: AtOnce(1, 1))
-    alone = returns_of(dynamics, obs, candidates, task, **settings)
-    np.testing.assert_allclose(alone, whole, rtol=1e-5)
-
-
-@pytest.mark.parametrize("members", [1, 2])
-def test_on_other_devices_than_cpus_the_same_noise_is_drawn_step_by_step(members, monkeypatch):
+def test_on_other_devices_than_cpus_the_same_noise_is_drawn_step_by_step(monkeypatch):
     candidates = np.zeros((1, 3, 4, 2), np.float32)
     dynamics = fold(toys.small_model(), np.zeros((1, 2, 1), int), context=jnp.ones((2, 1, 3)))
     before = returns_of(dynamics, np.zeros((1, 2)), candidates)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(AtOnce, "of", lambda *_: AtOnce(1, members))
     found = returns_of(dynamics, np.zeros((1, 2)), candidates)
     np.testing.assert_allclose(found, before, rtol=1e-5)
     assert len(set(found[0].tolist())) == 3

@@ -27,19 +27,12 @@ def _paper(spec: EnvSpec) -> Settings:
     return {"fitting.epochs": spec.epochs}
 
 
-_CHEAP_PLANNER: Settings = {
+_FAST_PLANNER: Settings = {
     "planner.num_candidates": 100,
     "planner.num_elites": 20,
     "planner.num_iterations": 3,
     "planner.num_particles": 5,
 }
-_FAST_PLANNER: Settings = {
-    **_CHEAP_PLANNER,
-    "planner.optimizer": "icem",
-    "planner.num_elites": 10,
-    "planner.noise_beta": 0.25,
-}
-"""Chosen on training physics of three environments (docs/performance.md)."""
 
 
 def _fast(spec: EnvSpec) -> Settings:
@@ -70,7 +63,7 @@ def _quick(spec: EnvSpec) -> Settings:
         "fitting.warmup_iterations": 2,
         "fitting.relation_transitions": 20,
         "planner.horizon": 20,
-        **_CHEAP_PLANNER,
+        **_FAST_PLANNER,
         "evaluation.every": 5,
         "evaluation.num_episodes": 8,
     }
@@ -100,7 +93,7 @@ def _smoke(spec: EnvSpec) -> Settings:
 
 _PRESETS = (
     Preset("paper", "the supplement's numbers; wants a GPU", _paper),
-    Preset("fast", "the paper's, but for a planner of a fifteenth of its arithmetic", _fast),
+    Preset("fast", "the paper's, but for a planner of a thirteenth of its arithmetic", _fast),
     Preset("quick", "a smaller network, planner and schedule; minutes on a laptop", _quick),
     Preset("smoke", "tiny sizes that only show that everything runs; seconds", _smoke),
     Preset(

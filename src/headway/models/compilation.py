@@ -1,14 +1,12 @@
-"""How functions that run the networks are compiled, on what, and where compiled ones are kept."""
+"""How functions that run the networks are compiled, and where compiled ones are kept."""
 
 import functools
-import os
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import platformdirs
 
-from headway.cpus import num_cpus
 from headway.models.meeting import Program, seat_here
 
 # Found by measuring on CPUs (docs/performance.md): full-width vectors make the activations
@@ -17,10 +15,6 @@ from headway.models.meeting import Program, seat_here
 _WIDE_VECTORS = {"xla_cpu_prefer_vector_width": 512}
 _NO_FUSIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
 _WANTED = {"float32": (_WIDE_VECTORS, _NO_FUSIONS), "bfloat16": (_WIDE_VECTORS,)}
-
-_FORCED = "xla_force_host_platform_device_count"
-MOST_CPU_DEVICES = 8
-"""With more, the share of each would be too small for fast products; each uses several CPUs."""
 
 
 @functools.cache
@@ -73,23 +67,4 @@ def keep_compilations() -> None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
 
 
-def make_device_of_each_cpu() -> None:
-    """Let JAX see every CPU as a device, so that plans share their candidates among them.
-
-    A program spreads over the CPUs of one device operation by operation, with a wait after each;
-    devices wait for each other once per optimizer iteration (docs/performance.md). Does nothing
-    once JAX has looked for its devices, or where the user has said how many there are:
-    `JAX_NUM_CPU_DEVICES=1` turns it off.
-    """
-    settings: Any = jax.config
-    chosen = settings.jax_num_cpu_devices != -1 or _FORCED in os.environ.get("XLA_FLAGS", "")
-    if chosen:
-        return
-    try:
-        jax.config.update("jax_num_cpu_devices", min(num_cpus(), MOST_CPU_DEVICES))
-    except RuntimeError:  # JAX runs already
-        return
-
-
 keep_compilations()
-make_device_of_each_cpu()

@@ -3,7 +3,7 @@
 Decided when a plan is compiled. None of it changes a result beyond rounding.
 """
 
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, TypeVar
 
 import jax
 import numpy as np
@@ -15,34 +15,25 @@ from headway.models.meeting import seeds_at_once
 Tree = TypeVar("Tree")
 Devices = Literal["local", "all"]
 
-CPU_BUDGET = 2**20
+CPU_BUDGET = 4 * 2**20
 """Bytes that one array of activations may take on a CPU: more would leave its caches."""
 ARRAYS = 8
 """How many such arrays a plan holds at most; the share of free GPU memory that one may take."""
 
 
-class AtOnce(NamedTuple):
-    """How much is imagined side by side, so that memory stays bounded and caches suffice."""
+def environments_at_once(num_envs: int, bytes_per_env: int) -> int:
+    """How many environments are imagined side by side, so that memory stays bounded.
 
-    envs: int
-    members: int
-    """All of them, or 1: where not all fit, one by one is faster on a CPU."""
+    Args:
+        num_envs: Environments in all.
+        bytes_per_env: Size of one environment's widest array of activations, for one seed.
 
-    @classmethod
-    def of(cls, num_envs: int, num_members: int, bytes_per_member: int) -> "AtOnce":
-        """As much as fits the budget, at least one member of one environment.
-
-        Args:
-            num_envs: Environments in all; they are spread evenly over the fewest chunks that fit.
-            num_members: Networks of each.
-            bytes_per_member: Size of the widest array of activations of one member of one
-                environment, for one seed.
-        """
-        fitting = activation_budget() // (bytes_per_member * seeds_at_once())
-        if fitting < num_members:
-            return cls(1, 1)
-        chunks = -(-num_envs // (fitting // num_members))
-        return cls(-(-num_envs // chunks), num_members)
+    Returns:
+        At least 1; the environments are spread evenly over the fewest chunks that fit.
+    """
+    fitting = max(1, activation_budget() // (bytes_per_env * seeds_at_once()))
+    chunks = -(-num_envs // fitting)
+    return -(-num_envs // chunks)
 
 
 def activation_budget() -> int:

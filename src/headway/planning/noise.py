@@ -1,17 +1,17 @@
 """Standard normal draws of imagined steps: the numbers of `jax.random.normal`, faster on CPUs.
 
 On CPUs JAX runs the rounds of its generator in a loop, which takes three times as long as one
-after the other. Here they stand one after the other, and a part of an array can be drawn without
-the rest, so that members that are imagined one by one draw what they would draw together.
+after the other. Here they stand one after the other.
 """
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
+from jaxtyping import Array, Float, PRNGKeyArray, UInt32
 
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
@@ -19,34 +19,21 @@ _WORDS = 2**32
 """Draws after which the second word of the counter would begin."""
 
 
-def normal(
-    key: PRNGKeyArray, shape: Sequence[int], row: Int[Array, ""] | None = None
-) -> Float[Array, "*shape"]:
-    """`jax.random.normal(key, shape)`, or one of its rows, which keeps its leading axis.
-
-    Args:
-        key: A key of any of JAX's generators.
-        shape: Of all draws.
-        row: Which part along the first axis; all of them where it is None.
-    """
+def normal(key: PRNGKeyArray, shape: Sequence[int]) -> Float[Array, "*shape"]:
+    """`jax.random.normal(key, shape)`, of any of JAX's generators."""
     ours = jax.default_backend() == "cpu" and str(jax.random.key_impl(key)) == "threefry2x32"
-    if not ours or not jax.config.jax_threefry_partitionable or math.prod(shape) >= _WORDS:  # pyright: ignore[reportAttributeAccessIssue]
-        draws = jax.random.normal(key, shape)
-        return draws if row is None else jax.lax.dynamic_slice_in_dim(draws, row, 1)
-    return _normal_of_bits(_bits(key, shape, row))
+    settings: Any = jax.config  # JAX declares its settings while running
+    if not ours or not settings.jax_threefry_partitionable or math.prod(shape) >= _WORDS:
+        return jax.random.normal(key, shape)
+    return _normal_of_bits(_bits(key, shape))
 
 
-def _bits(
-    key: PRNGKeyArray, shape: Sequence[int], row: Int[Array, ""] | None
-) -> UInt32[Array, "*shape"]:
+def _bits(key: PRNGKeyArray, shape: Sequence[int]) -> UInt32[Array, "*shape"]:
     """32 random bits for each place, which is its own counter."""
-    part = tuple(shape) if row is None else (1, *shape[1:])
-    strides = np.cumprod((1, *shape[:0:-1]), dtype=np.uint32)[::-1]
-    count = jnp.zeros(part, jnp.uint32)
+    strides = np.cumprod((1, *tuple(shape)[:0:-1]), dtype=np.uint32)[::-1]
+    count = jnp.zeros(shape, jnp.uint32)
     for axis, stride in enumerate(strides):
-        count += jax.lax.broadcasted_iota(jnp.uint32, part, axis) * stride
-    if row is not None:
-        count += row.astype(jnp.uint32) * strides[0]
+        count += jax.lax.broadcasted_iota(jnp.uint32, tuple(shape), axis) * stride
     first, second = threefry2x32(jax.random.key_data(key), jnp.zeros_like(count), count)
     return first ^ second
 

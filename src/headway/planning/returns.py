@@ -2,14 +2,14 @@
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.config import PlannerConfig
-from headway.planning.devices import AtOnce, Devices, spread_candidates
+from headway.planning.devices import Devices, environments_at_once, spread_candidates
 from headway.planning.imagination import over_rows
 from headway.planning.noise import normal
 from headway.tasks.base import Task
@@ -96,15 +96,6 @@ class Dynamics(Protocol):
         ...
 
 
-@runtime_checkable
-class Ensemble(Dynamics, Protocol):
-    """A `Dynamics` of several members that can also be imagined one by one."""
-
-    def of_member(self, member: Int[Array, ""]) -> "Dynamics":
-        """The dynamics of one member, whose arrays keep that axis; called after `of_env`."""
-        ...
-
-
 def candidate_returns(
     dynamics: Dynamics,
     task: Task,
@@ -130,18 +121,18 @@ def candidate_returns(
         key: Draws the noise of the rollouts.
     """
     num_envs, num_candidates = candidates.shape[:2]
-    rows = num_candidates * settings.particles_per_member
-    at_once = AtOnce.of(num_envs, dynamics.num_members, 4 * dynamics.widest * rows)
     keys = jax.vmap(functools.partial(jax.random.fold_in, key))(jnp.arange(num_envs))
 
     def of_one(part, obs, candidates, key):
-        imagined = _Imagined(dynamics.of_env(part), task, obs, candidates, settings, key)
-        return imagined.returns(one_by_one=at_once.members == 1)
+        one = dynamics.of_env(part)
+        return _environment_returns(one, task, obs, candidates, settings=settings, key=key)
 
+    rows = num_candidates * settings.particles_per_member * dynamics.num_members
+    at_once = environments_at_once(num_envs, 4 * dynamics.widest * rows)
     args: tuple[Any, Array, Array, PRNGKeyArray] = (dynamics.per_env, obs, candidates, keys)
-    if at_once.envs == num_envs:
+    if at_once == num_envs:
         return jax.vmap(of_one)(*args)
-    batch_size = at_once.envs if at_once.envs > 1 else None
+    batch_size = at_once if at_once > 1 else None
     return jax.lax.map(lambda one: of_one(*one), args, batch_size=batch_size)
 
 
@@ -178,100 +169,60 @@ def follow(
     return jax.vmap(of_one)(dynamics.per_env, obs, actions).transpose(2, 0, 1, 3)
 
 
-class _Imagined(NamedTuple):
-    """All that the rollouts of one environment are made of; layout as in `imagination`."""
+def _environment_returns(
+    dynamics: Dynamics,
+    task: Task,
+    obs: Float[Array, " obs"],
+    candidates: Float[Array, "candidate horizon action"],
+    *,
+    settings: RolloutSettings,
+    key: PRNGKeyArray,
+) -> Float[Array, " candidate"]:
+    """`candidate_returns` of one environment; layout as in `imagination`."""
+    num_candidates, horizon, action_size = candidates.shape
+    members, particles = dynamics.num_members, settings.particles_per_member
+    rows = members, particles, num_candidates
+    reward_of = task.released_reward if settings.released_reward else task.reward
+    reward_of, terminated = over_rows(reward_of), over_rows(task.terminated)
+    scale_action = over_rows(task.scale_action)
+    spread = functools.partial(spread_candidates, devices=settings.devices)
 
-    dynamics: Dynamics
-    task: Task
-    obs: Float[Array, " obs"]
-    candidates: Float[Array, "candidate horizon action"]
-    settings: RolloutSettings
-    key: PRNGKeyArray
+    def imagine(carry, step):
+        obs, alive, total, memory = carry
+        scaled, noise = step
+        scaled = spread(jnp.broadcast_to(scaled[:, None], (members, action_size, *rows[1:])))
+        drawn_before = noise is None or jnp.issubdtype(noise.dtype, jnp.floating)
+        drawn = noise if drawn_before else draw(noise)
+        memory, next_obs = dynamics.step(task, memory, obs, scaled, drawn)
+        action = scale_action(scaled)
+        total = total + jnp.where(alive, reward_of(obs, action, next_obs), 0.0)
+        alive = alive & ~terminated(obs, action, next_obs)
+        return (next_obs, alive, total, memory), None
 
-    def returns(self, *, one_by_one: bool) -> Float[Array, " candidate"]:
-        """`candidate_returns` of this environment.
+    def draw(key):
+        return spread(normal(key, (members, obs.shape[0], particles, num_candidates)))
 
-        Args:
-            one_by_one: Whether members that can be are imagined one after the other, so that
-                what one of them computes stays in the caches. The noise is the same.
-        """
-        dynamics = self.dynamics
-        if one_by_one and dynamics.num_members > 1 and isinstance(dynamics, Ensemble):
-            members = jnp.arange(dynamics.num_members)
-            total = jax.lax.map(lambda i: self._totals(dynamics.of_member(i), i)[0], members)
-        else:
-            total = self._totals(dynamics, None)
-        mean = total.mean((0, 1))
-        if not self.settings.risk_aversion:
-            return mean
-        return mean - self.settings.risk_aversion * total.std((0, 1))
-
-    def _totals(
-        self, dynamics: Dynamics, member: Int[Array, ""] | None
-    ) -> Float[Array, "member particle candidate"]:
-        """The return of every rollout, of one member or of all."""
-        num_candidates, _, action_size = self.candidates.shape
-        members = dynamics.num_members
-        rows = members, self.settings.particles_per_member, num_candidates
-        task, spread = self.task, self._spread
-        reward_of = task.released_reward if self.settings.released_reward else task.reward
-        reward_of, terminated = over_rows(reward_of), over_rows(task.terminated)
-        scale_action = over_rows(task.scale_action)
-
-        def imagine(carry, step):
-            obs, alive, total, memory = carry
-            scaled, noise = step
-            scaled = spread(jnp.broadcast_to(scaled[:, None], (members, action_size, *rows[1:])))
-            noise = self._drawn(noise, member)
-            memory, next_obs = dynamics.step(task, memory, obs, scaled, noise)
-            action = scale_action(scaled)
-            total = total + jnp.where(alive, reward_of(obs, action, next_obs), 0.0)
-            alive = alive & ~terminated(obs, action, next_obs)
-            return (next_obs, alive, total, memory), None
-
-        def wide(values):
-            shape = members, values.shape[-1], *rows[1:]
-            return spread(jnp.broadcast_to(values[..., None, None], shape))
-
-        memory = jax.tree.map(wide, dynamics.start())
-        carry = wide(self.obs), jnp.ones(rows, bool), jnp.zeros(rows), memory
-        steps = self.candidates.transpose(1, 2, 0), self._noise_of_steps(member)
-        (_, _, total, _), _ = jax.lax.scan(imagine, carry, steps)
-        return total
-
-    def _noise_of_steps(self, member: Int[Array, ""] | None) -> Array | None:
-        """The noise of all steps, of one member or of all; or keys to draw it with.
-
-        On a CPU it is drawn before the rollout, because XLA draws it several times over wherever
-        several operations of a step use it. Elsewhere that would take too much memory.
-        """
-        if not self.dynamics.stochastic:
+    def noise_of_steps():
+        if not dynamics.stochastic:
             return None
-        horizon, particles = self.candidates.shape[1], self.settings.particles_per_member
-        shape = self.dynamics.num_members, self.obs.shape[0], particles
-        if self.settings.shared_noise:
-            shared = jax.random.normal(self.key, (horizon, *shape))[..., None]
-            return shared if member is None else jax.lax.dynamic_slice_in_dim(shared, member, 1, 1)
-        keys = jax.random.split(self.key, horizon)
-        if jax.default_backend() != "cpu":
-            return keys
-        return self._spread(jax.vmap(lambda key: self._draw(key, member))(keys))
+        if settings.shared_noise:
+            shape = horizon, members, obs.shape[0], particles
+            return jax.random.normal(key, shape)[..., None]
+        keys = jax.random.split(key, horizon)
+        # On CPUs XLA would draw it again for every operation of a step that uses it, so it is
+        # drawn before. Elsewhere that would take too much memory.
+        return jax.vmap(draw)(keys) if jax.default_backend() == "cpu" else keys
 
-    def _drawn(
-        self, step: Array | None, member: Int[Array, ""] | None
-    ) -> Float[Array, "member obs particle #candidate"] | None:
-        """The noise of one step, drawn now if it is not yet."""
-        if step is None or jnp.issubdtype(step.dtype, jnp.floating):
-            return step
-        return self._spread(self._draw(step, member))
+    def wide(values):
+        return spread(
+            jnp.broadcast_to(values[..., None, None], (members, values.shape[-1], *rows[1:]))
+        )
 
-    def _draw(
-        self, key: PRNGKeyArray, member: Int[Array, ""] | None
-    ) -> Float[Array, "member obs particle candidate"]:
-        """One step's own noise for every candidate; that of one member is as it is with all."""
-        particles, candidates = self.settings.particles_per_member, len(self.candidates)
-        shape = self.dynamics.num_members, self.obs.shape[0], particles, candidates
-        return normal(key, shape, member)
-
-    def _spread(self, x: Array) -> Array:
-        return spread_candidates(x, self.settings.devices)
+    memory = jax.tree.map(wide, dynamics.start())
+    carry = wide(obs), jnp.ones(rows, bool), jnp.zeros(rows), memory
+    (_, _, total, _), _ = jax.lax.scan(
+        imagine, carry, (candidates.transpose(1, 2, 0), noise_of_steps())
+    )
+    if not settings.risk_aversion:
+        return total.mean((0, 1))
+    return total.mean((0, 1)) - settings.risk_aversion * total.std((0, 1))
