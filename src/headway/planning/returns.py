@@ -220,9 +220,8 @@ def _environment_returns(
 
     memory = jax.tree.map(wide, dynamics.start())
     carry = wide(obs), jnp.ones(rows, bool), jnp.zeros(rows), memory
-    (_, _, total, _), _ = jax.lax.scan(
-        imagine, carry, (candidates.transpose(1, 2, 0), noise_of_steps())
-    )
+    steps = candidates.transpose(1, 2, 0), noise_of_steps()
+    (_, _, total, _), _ = jax.lax.scan(imagine, carry, steps)
     if not settings.risk_aversion:
         return total.mean((0, 1))
     return total.mean((0, 1)) - settings.risk_aversion * total.std((0, 1))
