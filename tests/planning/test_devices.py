@@ -37,11 +37,14 @@ def actions(agent, num_envs=3, steps=3):
 
 
 def python(program, *args):
-    """A Python that can import what the tests can."""
+    """A Python that can import what the tests can.
+
+    XLA gets more threads than there are devices: with fewer its collectives can wait for good.
+    """
     paths = [str(Path(toys.__file__).parent), *sys.path]
     return subprocess.Popen(
         [sys.executable, "-c", program, *args],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths), "NPROC": "8"},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -69,11 +72,19 @@ def test_four_devices_choose_the_actions_of_one(settings):
 
 def on_devices(number, settings):
     """The actions of an agent on some simulated devices, and how many its state lies on."""
-    worker = python(PROGRAM, str(number), json.dumps(settings))
-    out, errors = worker.communicate()
-    assert worker.returncode == 0, errors[-2000:]
+    out = printed_by(python(PROGRAM, str(number), json.dumps(settings)))
     found, num_devices = out.splitlines()[-2:]
     return np.array(json.loads(found)), int(num_devices)
+
+
+def printed_by(worker):
+    """What a Python has printed once it has ended well."""
+    try:
+        out, errors = worker.communicate(timeout=120)
+    finally:
+        worker.kill()
+    assert worker.returncode == 0, errors[-2000:]
+    return out
 
 
 COMPILED_PROGRAM = """
@@ -95,10 +106,7 @@ print(len(compiled))
 
 
 def test_devices_that_share_a_plan_compile_it_once():
-    worker = python(COMPILED_PROGRAM)
-    out, errors = worker.communicate()
-    assert worker.returncode == 0, errors[-2000:]
-    assert out.split() == ["True", "0"]
+    assert printed_by(python(COMPILED_PROGRAM)).split() == ["True", "0"]
 
 
 SHARED_PROGRAM = """
