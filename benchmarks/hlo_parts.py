@@ -33,6 +33,7 @@ RULES = (
     ("models/networks.py", "bound_logvar", SAMPLING),
     ("planning/imagination.py", "Layer.__call__", ACTIVATION),
     ("planning/imagination.py", "rounded", ACTIVATION),
+    ("planning/imagination.py", "rough_swish", ACTIVATION),
     ("planning/imagination.py", "fold", BEFORE),
     ("planning/imagination.py", "", SAMPLING),
     ("planning/returns.py", "", ROLLOUT),
