@@ -1,39 +1,41 @@
-"""The noise of imagined steps against JAX's own generator, and known blocks of its cipher."""
+"""Coloured noise has the spectrum, the size and the independence it promises."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from headway.planning.noise import normal, threefry2x32
+from headway.planning.optimizers.noise import colored_noise
 
 
-@pytest.mark.parametrize("shape", [(1,), (3,), (2, 7, 3), (5, 4, 2, 25), (1, 1, 1, 1)])
-def test_draws_are_those_of_jax(shape):
-    key = jax.random.key(7)
-    np.testing.assert_array_equal(normal(key, shape), jax.random.normal(key, shape))
+def draw(beta, *, horizon=32, num_draws=4000):
+    shape = (num_draws, horizon, 2)
+    return np.float64(colored_noise(jax.random.key(0), shape, beta))
 
 
-def test_draws_of_another_generator_are_those_of_jax_too():
-    key = jax.random.key(8, impl="rbg")
-    np.testing.assert_array_equal(normal(key, (2, 5)), jax.random.normal(key, (2, 5)))
+@pytest.mark.parametrize("beta", [0.0, 0.5, 1.0, 2.0, 3.5])
+def test_power_falls_with_frequency_by_the_exponent(beta):
+    power = (np.abs(np.fft.rfft(draw(beta), axis=1)) ** 2).mean((0, 2))
+    frequency = np.arange(1, 16)  # neither the constant part nor the highest frequency
+    slope, _ = np.polyfit(np.log(frequency), np.log(power[1:16]), 1)
+    assert slope == pytest.approx(-beta, abs=0.05)
 
 
-def test_draws_of_many_keys_at_once_are_those_of_each():
-    keys = jax.random.split(jax.random.key(1), 3)
-    together = jax.vmap(lambda key: normal(key, (2, 5)))(keys)
-    np.testing.assert_array_equal(together, [jax.random.normal(key, (2, 5)) for key in keys])
+@pytest.mark.parametrize("beta", [0.0, 2.0])
+@pytest.mark.parametrize("horizon", [1, 2, 7, 32])
+def test_every_step_has_zero_mean_and_unit_variance(beta, horizon):
+    noise = draw(beta, horizon=horizon)
+    np.testing.assert_allclose(noise.mean(0), 0.0, atol=0.07)
+    np.testing.assert_allclose(noise.var(0), 1.0, atol=0.12)
 
 
-@pytest.mark.parametrize(
-    ("key", "counter", "block"),
-    [
-        ((0, 0), (0, 0), (0x6B200159, 0x99BA4EFE)),
-        ((2**32 - 1, 2**32 - 1), (2**32 - 1, 2**32 - 1), (0x1CB996FC, 0xBB002BE7)),
-        ((0x13198A2E, 0x03707344), (0x243F6A88, 0x85A308D3), (0xC4923A9C, 0x483DF7A0)),
-    ],
-)
-def test_known_answers_of_the_cipher(key, counter, block):
-    """Those that its authors publish with Random123 (kat_vectors, threefry 2x32, 20 rounds)."""
-    found = threefry2x32(jnp.asarray(key, jnp.uint32), *map(jnp.uint32, counter))
-    assert tuple(int(word) for word in found) == block
+def test_actions_and_draws_are_independent():
+    noise = draw(2.0)
+    assert abs(np.corrcoef(noise[:, 5, 0], noise[:, 5, 1])[0, 1]) < 0.06
+    assert abs(np.corrcoef(noise[:-1, 5, 0], noise[1:, 5, 0])[0, 1]) < 0.06
+    assert np.corrcoef(noise[:, 5, 0], noise[:, 6, 0])[0, 1] > 0.8
+
+
+def test_exponent_zero_is_plain_normal_noise():
+    shape = (3, 5, 2)
+    white = jax.random.normal(jax.random.key(0), shape)
+    np.testing.assert_array_equal(colored_noise(jax.random.key(0), shape, 0.0), white)

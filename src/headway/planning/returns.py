@@ -187,13 +187,17 @@ def _environment_returns(
     scale_action = over_rows(task.scale_action)
     spread = functools.partial(spread_candidates, devices=settings.devices)
 
+    # On CPUs XLA would draw noise again for every operation of a step that uses it, so it is
+    # drawn before the rollout. Elsewhere that would take too much memory.
+    independent = dynamics.stochastic and not settings.shared_noise
+    step_by_step = independent and jax.default_backend() != "cpu"
+
     def imagine(carry, step):
         obs, alive, total, memory = carry
         scaled, noise = step
         scaled = spread(jnp.broadcast_to(scaled[:, None], (members, action_size, *rows[1:])))
-        drawn_before = noise is None or jnp.issubdtype(noise.dtype, jnp.floating)
-        drawn = noise if drawn_before else draw(noise)
-        memory, next_obs = dynamics.step(task, memory, obs, scaled, drawn)
+        noise = draw(noise) if step_by_step else noise
+        memory, next_obs = dynamics.step(task, memory, obs, scaled, noise)
         action = scale_action(scaled)
         total = total + jnp.where(alive, reward_of(obs, action, next_obs), 0.0)
         alive = alive & ~terminated(obs, action, next_obs)
@@ -209,9 +213,7 @@ def _environment_returns(
             shape = horizon, members, obs.shape[0], particles
             return jax.random.normal(key, shape)[..., None]
         keys = jax.random.split(key, horizon)
-        # On CPUs XLA would draw it again for every operation of a step that uses it, so it is
-        # drawn before. Elsewhere that would take too much memory.
-        return jax.vmap(draw)(keys) if jax.default_backend() == "cpu" else keys
+        return keys if step_by_step else jax.vmap(draw)(keys)
 
     def wide(values):
         return spread(
