@@ -68,15 +68,44 @@ class Optimizer(eqx.Module):
         """A search before its first iteration."""
 
     @abc.abstractmethod
-    def iterate(self, score: Score, search: Any, key: PRNGKeyArray, iteration: int = 0) -> Any:
-        """Draw candidates, score them, learn from them.
+    def ask(
+        self, search: Any, key: PRNGKeyArray, iteration: int = 0
+    ) -> Float[Array, "env candidate horizon action"]:
+        """Draw the candidates of an iteration.
 
         Args:
-            score: Returns of candidates; a non-finite one ranks last.
+            search: The search so far.
+            key: Draws them.
+            iteration: Which iteration; only its `kind` matters.
+        """
+
+    @abc.abstractmethod
+    def tell(
+        self,
+        search: Any,
+        candidates: Float[Array, "env candidate horizon action"],
+        returns: Float[Array, "env candidate"],
+    ) -> Any:
+        """Learn from the returns of candidates; a non-finite one ranks last.
+
+        Args:
+            search: The search that asked for them.
+            candidates: Action sequences.
+            returns: Their returns.
+        """
+
+    def iterate(self, score: Score, search: Any, key: PRNGKeyArray, iteration: int = 0) -> Any:
+        """Ask for candidates, score them, tell their returns.
+
+        Args:
+            score: Returns of candidates.
             search: The search so far.
             key: Draws the candidates, and is handed on to `score`.
             iteration: Which iteration; only its `kind` matters.
         """
+        ask_key, score_key = jax.random.split(key)
+        candidates = self.ask(search, ask_key, iteration)
+        return self.tell(search, candidates, score(candidates, score_key))
 
     @abc.abstractmethod
     def end(self, search: Any) -> Plan:

@@ -91,7 +91,7 @@ class CEM(Optimizer):
     def _until_settled(
         self, score: Score, search: "_Search", keys: Key[Array, " iteration"]
     ) -> "_Search":
-        """Iterate while an environment is not settled; the settled ones stay as they are."""
+        """Iterate while an environment is not settled."""
 
         def unsettled(carry):
             iteration, search = carry
@@ -99,19 +99,38 @@ class CEM(Optimizer):
 
         def iterate(carry):
             iteration, search = carry
-            found = self.iterate(score, search, keys[iteration])
-            return iteration + 1, where_env(search.settled, search, found)
+            return iteration + 1, self.iterate(score, search, keys[iteration])
 
         return jax.lax.while_loop(unsettled, iterate, (0, search))[1]
 
-    def iterate(
-        self, score: Score, search: "_Search", key: PRNGKeyArray, iteration: int = 0
-    ) -> "_Search":
-        """See `Optimizer.iterate`."""
+    def ask(
+        self, search: "_Search", key: PRNGKeyArray, iteration: int = 0
+    ) -> Float[Array, "env candidate horizon action"]:
+        """See `Optimizer.ask`: a normal truncated at two deviations, narrowed to stay inside ±1."""
         del iteration  # all are alike
-        draw_key, score_key = jax.random.split(key)
-        candidates = self._draw(search.mean, search.var, draw_key)
-        returns = rank_non_finite_last(score(candidates, score_key))
+        room = jnp.minimum(jnp.square((search.mean + 1) / 2), jnp.square((1 - search.mean) / 2))
+        std = jnp.sqrt(jnp.minimum(room, search.var))
+        num_envs, *sequence_shape = search.mean.shape
+        shape = num_envs, self.num_candidates, *sequence_shape
+        draws = jax.random.truncated_normal(key, -2.0, 2.0, shape)
+        return search.mean[:, None] + std[:, None] * draws
+
+    def tell(
+        self,
+        search: "_Search",
+        candidates: Float[Array, "env candidate horizon action"],
+        returns: Float[Array, "env candidate"],
+    ) -> "_Search":
+        """See `Optimizer.tell`; an environment that is settled stays as it is."""
+        found = self._learned(search, candidates, rank_non_finite_last(returns))
+        return where_env(search.settled, search, found) if self.settle_tolerance else found
+
+    def _learned(
+        self,
+        search: "_Search",
+        candidates: Float[Array, "env candidate horizon action"],
+        returns: Float[Array, "env candidate"],
+    ) -> "_Search":
         # The elites: the best candidates, those with a finite return only.
         elites, elite_returns = best_candidates(candidates, returns, self.num_elites)
         finite = jnp.isfinite(elite_returns)
@@ -130,16 +149,6 @@ class CEM(Optimizer):
             evaluations=search.evaluations + self.num_candidates,
             settled=found & (moved < self.settle_tolerance),
         )
-
-    def _draw(
-        self, mean: Float[Array, "env horizon action"], var: Float[Array, "env horizon action"], key
-    ) -> Float[Array, "env candidate horizon action"]:
-        """Draw from a normal truncated at two deviations, narrowed to stay inside ±1."""
-        room = jnp.minimum(jnp.square((mean + 1) / 2), jnp.square((1 - mean) / 2))
-        std = jnp.sqrt(jnp.minimum(room, var))
-        shape = (mean.shape[0], self.num_candidates, *mean.shape[1:])
-        draws = jax.random.truncated_normal(key, -2.0, 2.0, shape)
-        return mean[:, None] + std[:, None] * draws
 
 
 class _Search(NamedTuple):

@@ -67,15 +67,14 @@ class ICEM(Optimizer):
             search = self.iterate(score, search, part, iteration)
         return self.end(search)
 
-    def iterate(
-        self, score: Score, search: "_Search", key: PRNGKeyArray, iteration: int = 0
-    ) -> "_Search":
-        """See `Optimizer.iterate`."""
-        draw_key, score_key = jax.random.split(key)
-        candidates = self._candidates(search, self.populations[iteration], draw_key)
+    def ask(
+        self, search: "_Search", key: PRNGKeyArray, iteration: int = 0
+    ) -> Float[Array, "env candidate horizon action"]:
+        """See `Optimizer.ask`."""
+        candidates = self._candidates(search, self.populations[iteration], key)
         if iteration == self.num_iterations - 1:
             candidates = jnp.concatenate([candidates, search.mean[:, None]], axis=1)
-        return self._learn(search, candidates, score(candidates, score_key))
+        return candidates
 
     def end(self, search: "_Search") -> Plan:
         """See `Optimizer.end`."""
@@ -124,13 +123,13 @@ class ICEM(Optimizer):
         kept = jnp.where(known, search.elites, drawn[:, population:])
         return jnp.concatenate([drawn[:, :population], kept], axis=1)
 
-    def _learn(
+    def tell(
         self,
         search: "_Search",
         candidates: Float[Array, "env candidate horizon action"],
         returns: Float[Array, "env candidate"],
     ) -> "_Search":
-        """Move the distribution towards the elites; nothing moves where no return is finite."""
+        """See `Optimizer.tell`; nothing moves where no return is finite."""
         search = search._replace(evaluations=search.evaluations + candidates.shape[1])
         returns = rank_non_finite_last(returns)
         elites, elite_returns = best_candidates(candidates, returns, self.num_elites)

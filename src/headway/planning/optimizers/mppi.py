@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from headway.planning.optimizers.base import Optimizer, Plan, Score, SearchState
+from headway.planning.optimizers.base import Optimizer, Plan, SearchState
 from headway.planning.optimizers.noise import colored_noise
 from headway.planning.optimizers.ranking import rank_non_finite_last
 
@@ -38,17 +38,24 @@ class MPPI(Optimizer):
         none = jnp.zeros(len(state.guess), jnp.int32)
         return _Search(state.guess, jnp.zeros(len(state.guess)), none, none)
 
-    def iterate(
-        self, score: Score, search: "_Search", key: PRNGKeyArray, iteration: int = 0
-    ) -> "_Search":
-        """See `Optimizer.iterate`."""
+    def ask(
+        self, search: "_Search", key: PRNGKeyArray, iteration: int = 0
+    ) -> Float[Array, "env candidate horizon action"]:
+        """See `Optimizer.ask`."""
         del iteration  # all are alike
         num_envs, *sequence_shape = search.mean.shape
-        draw_key, score_key = jax.random.split(key)
         shape = (num_envs, self.num_candidates, *sequence_shape)
-        noise = colored_noise(draw_key, shape, self.noise_beta)
-        candidates = jnp.clip(search.mean[:, None] + self.initial_std * noise, -1.0, 1.0)
-        returns = rank_non_finite_last(score(candidates, score_key))
+        noise = colored_noise(key, shape, self.noise_beta)
+        return jnp.clip(search.mean[:, None] + self.initial_std * noise, -1.0, 1.0)
+
+    def tell(
+        self,
+        search: "_Search",
+        candidates: Float[Array, "env candidate horizon action"],
+        returns: Float[Array, "env candidate"],
+    ) -> "_Search":
+        """See `Optimizer.tell`."""
+        returns = rank_non_finite_last(returns)
         weights = softmax_weights(returns, self.temperature)
         found = jnp.isfinite(returns).any(-1)
         average = (weights[..., None, None] * candidates).sum(1)

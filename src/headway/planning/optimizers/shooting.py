@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from headway.planning.optimizers.base import Optimizer, Plan, Score, SearchState
+from headway.planning.optimizers.base import Optimizer, Plan, SearchState
 from headway.planning.optimizers.ranking import rank_non_finite_last
 
 
@@ -29,16 +29,23 @@ class RandomShooting(Optimizer):
         none = jnp.zeros(len(state.guess), jnp.int32)
         return _Search(state.guess, jnp.full(len(state.guess), -jnp.inf), none, none)
 
-    def iterate(
-        self, score: Score, search: "_Search", key: PRNGKeyArray, iteration: int = 0
-    ) -> "_Search":
-        """See `Optimizer.iterate`."""
+    def ask(
+        self, search: "_Search", key: PRNGKeyArray, iteration: int = 0
+    ) -> Float[Array, "env candidate horizon action"]:
+        """See `Optimizer.ask`."""
         del iteration  # all are alike
         num_envs, *sequence_shape = search.best.shape
-        draw_key, score_key = jax.random.split(key)
         shape = (num_envs, self.num_candidates, *sequence_shape)
-        candidates = jax.random.uniform(draw_key, shape, minval=-1.0, maxval=1.0)
-        returns = rank_non_finite_last(score(candidates, score_key))
+        return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
+
+    def tell(
+        self,
+        search: "_Search",
+        candidates: Float[Array, "env candidate horizon action"],
+        returns: Float[Array, "env candidate"],
+    ) -> "_Search":
+        """See `Optimizer.tell`."""
+        returns = rank_non_finite_last(returns)
         winner = jnp.argmax(returns, axis=-1)
         top = jnp.take_along_axis(returns, winner[:, None], axis=1)[:, 0]
         sequence = jnp.take_along_axis(candidates, winner[:, None, None, None], axis=1)[:, 0]
