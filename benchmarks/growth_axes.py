@@ -14,7 +14,7 @@ from headway.models.compilation import compiler_options, jit_networks
 from headway.models.dynamics import Statistics
 from headway.models.fitting import assign_segments, fit_epoch, make_data
 from headway.models.meeting import Program, in_groups, stack
-from headway.planning.step import _act
+from headway.planning.search import act_in_one
 from headway.tasks.catalog import env_spec
 
 MODEL = ModelConfig(
@@ -65,7 +65,7 @@ def epoch(transitions: int = 10_000, members: int = MODEL.num_members) -> Work:
 def plan_of_seeds(seeds: int) -> Work:
     """One plan of every seed, as seeds that are trained together are computed."""
     agent, state, obs = make_agent(NUM_ENVS, MODEL, PLANNER)
-    return _over_seeds(_act, seeds, (agent, state, obs), {})
+    return _over_seeds(act_in_one, seeds, (agent, state, obs), {})
 
 
 def epoch_of_seeds(seeds: int) -> Work:

@@ -5,17 +5,23 @@ import dataclasses
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+
+
+class Operation(NamedTuple):
+    """An operation of a compiled module; several modules have operations of one name."""
+
+    module: str
+    name: str
 
 
 @dataclasses.dataclass(frozen=True)
 class Span:
     """One run of one operation; times in seconds."""
 
-    op: str
-    module: str
+    op: Operation
     start: float
     end: float
 
@@ -56,8 +62,7 @@ def _spans(events: list[tuple[Any, dict[str, Any]]]) -> list[Span]:
     }
     return [
         Span(
-            str(stats["hlo_op"]),
-            str(stats.get("hlo_module", "")),
+            Operation(str(stats.get("hlo_module", "")), str(stats["hlo_op"])),
             1e-9 * event.start_ns,
             1e-9 * max(event.end_ns, ends.get(stats.get("_p"), 0)),
         )
@@ -66,7 +71,7 @@ def _spans(events: list[tuple[Any, dict[str, Any]]]) -> list[Span]:
     ]
 
 
-def exclusive_seconds(spans: list[Span]) -> dict[str, float]:
+def exclusive_seconds(spans: list[Span]) -> dict[Operation, float]:
     """Split the time from first to last event over the operations.
 
     Of the operations under way, the one that began last has the time: operations nest (a loop
@@ -77,7 +82,7 @@ def exclusive_seconds(spans: list[Span]) -> dict[str, float]:
         [(span.start, True, i) for i, span in enumerate(spans)]
         + [(span.end, False, i) for i, span in enumerate(spans)]
     )
-    seconds: dict[str, float] = collections.defaultdict(float)
+    seconds: dict[Operation, float] = collections.defaultdict(float)
     running: set[int] = set()
     before = moments[0][0]
     for now, starts, index in moments:

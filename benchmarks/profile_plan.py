@@ -19,7 +19,7 @@ from typing import Any
 
 import jax
 from hlo_parts import CONTAINERS, Module
-from op_trace import exclusive_seconds, record
+from op_trace import Operation, exclusive_seconds, record
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -39,8 +39,8 @@ class Profile:
     traced: float
     """Of the traced plan, first to last operation."""
     parts: dict[str, float]
-    operations: dict[str, float]
-    shares: dict[str, dict[str, float]]
+    operations: dict[Operation, float]
+    shares: dict[Operation, dict[str, float]]
     """The parts of each operation."""
 
 
@@ -49,7 +49,7 @@ def profile(function: Callable[[], Any], rounds: int = 3) -> Profile:
     jax.block_until_ready(function())
     plain = statistics.median(seconds(function) for _ in range(rounds))
     spans = record(function)
-    shares, containers = operation_shares({span.module for span in spans})
+    shares, containers = operation_shares({span.op.module for span in spans})
     operations = exclusive_seconds(spans)
     parts: dict[str, float] = collections.defaultdict(float)
     for op, time_taken in operations.items():
@@ -68,17 +68,20 @@ def seconds(function: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
-def operation_shares(modules: set[str]) -> tuple[dict[str, dict[str, float]], set[str]]:
+def operation_shares(
+    modules: set[str],
+) -> tuple[dict[Operation, dict[str, float]], set[Operation]]:
     """The parts of every operation of the loaded modules, and which operations are loops."""
-    shares: dict[str, dict[str, float]] = collections.defaultdict(lambda: {"other": 1.0})
+    shares: dict[Operation, dict[str, float]] = collections.defaultdict(lambda: {"other": 1.0})
     containers = set()
     for executable in jax.devices()[0].client.live_executables():
         for module in executable.hlo_modules():
             if module.name in modules:
                 for instruction, parts in Module(module.to_string()).operations():
-                    shares[instruction.name] = parts
+                    operation = Operation(module.name, instruction.name)
+                    shares[operation] = parts
                     if instruction.opcode in CONTAINERS:
-                        containers.add(instruction.name)
+                        containers.add(operation)
     return shares, containers
 
 
@@ -93,7 +96,7 @@ def show(found: Profile, top: int) -> None:
     for op, taken in sorted(found.operations.items(), key=lambda item: -item[1])[:top]:
         mix = sorted(found.shares[op].items(), key=lambda item: -item[1])
         text = ", ".join(f"{part} {share:.0%}" for part, share in mix if share >= 0.01)
-        operations.add_row(op, f"{1e3 * taken:.1f}", text)
+        operations.add_row(op.name, f"{1e3 * taken:.1f}", text)
     console.print(operations)
     console.print(
         f"one plan: {1e3 * found.plain:.1f} ms, under the profiler {1e3 * found.traced:.1f} ms; "

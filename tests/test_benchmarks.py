@@ -6,7 +6,7 @@ import pytest
 from growth import exponent
 from hlo_parts import ACTIVATION, NOISE, PRODUCTS, SAMPLING, SEARCH, TASK, Module
 from machine import machine_kind
-from op_trace import Span, exclusive_seconds
+from op_trace import Operation, Span, exclusive_seconds
 from profile_plan import OVERHEAD, profile
 from reporting import NOT_MEASURED, Report, markdown_table
 from save import save
@@ -87,11 +87,11 @@ def test_exponent_is_that_of_the_upper_half():
 
 def test_time_belongs_to_the_operation_that_began_last():
     spans = [
-        Span("loop", "m", 0.0, 10.0),
-        Span("product", "m", 1.0, 7.0),  # its end is noted late
-        Span("activation", "m", 4.0, 6.0),
+        Span(Operation("m", "loop"), 0.0, 10.0),
+        Span(Operation("m", "product"), 1.0, 7.0),  # its end is noted late
+        Span(Operation("n", "product"), 4.0, 6.0),
     ]
-    assert exclusive_seconds(spans) == {"loop": 1 + 3, "product": 3 + 1, "activation": 2}
+    assert list(exclusive_seconds(spans).values()) == [1 + 3, 3 + 1, 2]
 
 
 @pytest.fixture(scope="module")

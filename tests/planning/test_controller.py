@@ -77,8 +77,8 @@ class Work:
         self.now = 0.0
         self.planner = DeadlinePlanner(agent, seconds, lambda: self.now)
         self.costs = dict(zip(("begin", "iterate", "end"), costs, strict=True))
-        parts = self.planner._compiled
-        self.planner._compiled = {name: self.costly(name, parts[name]) for name in parts}
+        parts = self.planner._parts
+        self.planner._parts = {name: self.costly(name, parts[name]) for name in parts}
         self.planner.warm_up()
 
     def costly(self, name, part):

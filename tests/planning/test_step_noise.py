@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from headway.planning.noise import normal, threefry2x32
+from headway.planning.noise import normal, normal_block, threefry2x32
 
 
 @pytest.mark.parametrize("shape", [(1,), (3,), (2, 7, 3), (5, 4, 2, 25), (1, 1, 1, 1)])
@@ -23,6 +23,14 @@ def test_draws_of_many_keys_at_once_are_those_of_each():
     keys = jax.random.split(jax.random.key(1), 3)
     together = jax.vmap(lambda key: normal(key, (2, 5)))(keys)
     np.testing.assert_array_equal(together, [jax.random.normal(key, (2, 5)) for key in keys])
+
+
+@pytest.mark.parametrize("impl", ["threefry2x32", "rbg"])
+def test_a_block_is_that_of_the_whole(impl):
+    key = jax.random.key(9, impl=impl)
+    whole = jax.random.normal(key, (4, 3, 2, 10))
+    block = jax.jit(lambda start: normal_block(key, whole.shape, (start, 0, 1, 5), (2, 3, 1, 4)))
+    np.testing.assert_array_equal(block(1), whole[1:3, :, 1:, 5:9])
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from headway.planning.last_layer.learning import (
 )
 from headway.planning.last_layer.regression import Prior
 from headway.planning.optimizers import Plan, SearchState, make_optimizer, where_env
-from headway.planning.step import act
+from headway.planning.search import act
 from headway.tasks.base import Task
 
 

@@ -14,14 +14,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Float
 
 from headway.errors import ConfigError
-from headway.models.compilation import jit_networks
 from headway.planning.acting import Decision
-from headway.planning.devices import brought_to_each, whole_on_each
 from headway.planning.optimizers import make_optimizer
-from headway.planning.step import Planning, scoring
+from headway.planning.search import begin, end, iterate
+from headway.planning.step import Planning
 
 REMEMBERED = 32
 """Calls whose durations are remembered."""
@@ -61,7 +60,7 @@ class DeadlinePlanner:
             )
         self._agent, self._seconds, self._clock = agent, seconds, clock
         self._optimizer = make_optimizer(agent.planner)
-        self._compiled = _COMPILED[agent.planner.precision]
+        self._parts: dict[str, Callable] = {"begin": begin, "iterate": iterate, "end": end}
         self._durations = {name: deque([0.0], REMEMBERED) for name in ("iterate", "end")}
 
     def warm_up(self) -> None:
@@ -91,22 +90,17 @@ class DeadlinePlanner:
             at_least: Iterations to make even if they are late.
         """
         until = started + self._seconds
-        begin, seen = self._compiled["begin"], jnp.asarray(obs)
-        state = brought_to_each(state, self._agent.planner.devices)
-        prepared, keys, search = jax.block_until_ready(begin(self._agent, state, seen))
+        begun, search = self._timed("begin", state, jnp.asarray(obs))
         done, settled = 0, False
         while done < self._optimizer.num_iterations and not settled:
             if done >= at_least and not self._fits(until):
                 break
-            kind = self._optimizer.kind(done)
-            search, settled = self._timed(
-                "iterate", self._agent, prepared, seen, search, keys[done], kind
-            )
+            search, settled = self._timed("iterate", begun, search, done)
             settled = bool(settled.all())
             done += 1
         if done == 0:
             self._forget_slowest()
-        state, decision = self._timed("end", self._agent, state, seen, prepared, search)
+        state, decision = self._timed("end", state, begun, search)
         complete = settled or done == self._optimizer.num_iterations
         return Outcome(state, decision, done, complete)
 
@@ -119,48 +113,10 @@ class DeadlinePlanner:
             if not durations:
                 durations.append(0.0)
 
-    def _timed(self, name: str, *parts: Any) -> Any:
+    def _timed(self, name: str, *args: Any) -> Any:
+        """Call a part of the step to its end, and remember how long it took if that matters."""
         started = self._clock()
-        found = jax.block_until_ready(self._compiled[name](*parts))
-        self._durations[name].append(self._clock() - started)
+        found = jax.block_until_ready(self._parts[name](self._agent, *args))
+        if name in self._durations:
+            self._durations[name].append(self._clock() - started)
         return found
-
-
-def _begin(
-    agent: Planning, state: Any, obs: Float[Array, "env obs"]
-) -> tuple[Any, list[PRNGKeyArray], Any]:
-    prepared = agent.prepare(state, obs)
-    optimizer = make_optimizer(agent.planner)
-    keys = jax.random.split(prepared.plan_key, optimizer.num_iterations)
-    begun = prepared, list(keys), optimizer.begin(state.search)
-    return whole_on_each(begun, agent.planner.devices)
-
-
-def _iterate(
-    agent: Planning,
-    prepared: Any,
-    obs: Float[Array, "env obs"],
-    search: Any,
-    key: PRNGKeyArray,
-    iteration: int,
-) -> tuple[Any, Bool[Array, " env"]]:
-    optimizer = make_optimizer(agent.planner)
-    score = scoring(agent.task, agent.planner, prepared.dynamics, obs)
-    search = optimizer.iterate(score, search, key, iteration)
-    return whole_on_each((search, optimizer.settled(search)), agent.planner.devices)
-
-
-def _end(
-    agent: Planning, state: Any, obs: Float[Array, "env obs"], prepared: Any, search: Any
-) -> tuple[Any, Decision]:
-    plan = make_optimizer(agent.planner).end(search)
-    return whole_on_each(agent.decide(state, obs, prepared, plan), agent.planner.devices)
-
-
-_COMPILED = {
-    precision: {
-        name: jit_networks(function, precision=precision)
-        for name, function in (("begin", _begin), ("iterate", _iterate), ("end", _end))
-    }
-    for precision in ("float32", "bfloat16")
-}

@@ -17,21 +17,25 @@ Devices = Literal["local", "all"]
 
 CPU_BUDGET = 4 * 2**20
 """Bytes that one array of activations may take on a CPU: more would leave its caches."""
+SHARE_BUDGET = 2**20
+"""The same where every core has a program of its own, and so only its own caches."""
 ARRAYS = 8
 """How many such arrays a plan holds at most; the share of free GPU memory that one may take."""
 
 
-def environments_at_once(num_envs: int, bytes_per_env: int) -> int:
+def environments_at_once(num_envs: int, bytes_per_env: int, budget: int | None = None) -> int:
     """How many environments are imagined side by side, so that memory stays bounded.
 
     Args:
         num_envs: Environments in all.
         bytes_per_env: Size of one environment's widest array of activations, for one seed.
+        budget: Bytes that all of them may take together; None for the `activation_budget`.
 
     Returns:
         At least 1; the environments are spread evenly over the fewest chunks that fit.
     """
-    fitting = max(1, activation_budget() // (bytes_per_env * seeds_at_once()))
+    budget = activation_budget() if budget is None else budget
+    fitting = max(1, budget // (bytes_per_env * seeds_at_once()))
     chunks = -(-num_envs // fitting)
     return -(-num_envs // chunks)
 

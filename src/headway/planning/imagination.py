@@ -173,6 +173,13 @@ class ImaginedDynamics(eqx.Module):
             hidden[self.context_layer] = layer._replace(bias=part.context_bias)
         return ImaginedDynamics(tuple(hidden), part, self.delta_std, self.context_layer)
 
+    def of_member(self, member: Int[Array, ""]) -> "ImaginedDynamics":
+        """See `Ensemble.of_member`."""
+        hidden, heads = jax.tree.map(
+            lambda x: jax.lax.dynamic_slice_in_dim(x, member, 1), (self.hidden, self.heads)
+        )
+        return ImaginedDynamics(hidden, heads, self.delta_std, self.context_layer)
+
     @property
     def widest(self) -> int:
         """See `Dynamics.widest`."""

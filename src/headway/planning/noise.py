@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray, UInt32
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
 
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
@@ -21,19 +21,43 @@ _WORDS = 2**32
 
 def normal(key: PRNGKeyArray, shape: Sequence[int]) -> Float[Array, "*shape"]:
     """`jax.random.normal(key, shape)`, of any of JAX's generators."""
+    return normal_block(key, shape, [0] * len(shape), shape)
+
+
+def normal_block(
+    key: PRNGKeyArray,
+    shape: Sequence[int],
+    start: Sequence[int | Int[Array, ""]],
+    size: Sequence[int],
+) -> Float[Array, "*size"]:
+    """A block of `jax.random.normal(key, shape)`, mostly without drawing the rest.
+
+    Args:
+        key: Of any of JAX's generators.
+        shape: Of the whole.
+        start: Where in the whole the block begins, along each axis.
+        size: Of the block, which lies within the whole.
+    """
     ours = jax.default_backend() == "cpu" and str(jax.random.key_impl(key)) == "threefry2x32"
     settings: Any = jax.config  # JAX declares its settings while running
     if not ours or not settings.jax_threefry_partitionable or math.prod(shape) >= _WORDS:
-        return jax.random.normal(key, shape)
-    return _normal_of_bits(_bits(key, shape))
+        whole = jax.random.normal(key, shape)
+        return whole if whole.shape == tuple(size) else jax.lax.dynamic_slice(whole, start, size)
+    return _normal_of_bits(_bits(key, shape, start, size))
 
 
-def _bits(key: PRNGKeyArray, shape: Sequence[int]) -> UInt32[Array, "*shape"]:
-    """32 random bits for each place, which is its own counter."""
+def _bits(
+    key: PRNGKeyArray,
+    shape: Sequence[int],
+    start: Sequence[int | Int[Array, ""]],
+    size: Sequence[int],
+) -> UInt32[Array, "*size"]:
+    """32 random bits for each place of a block; a place's counter is its index in the whole."""
     strides = np.cumprod((1, *tuple(shape)[:0:-1]), dtype=np.uint32)[::-1]
-    count = jnp.zeros(shape, jnp.uint32)
+    count = jnp.zeros(size, jnp.uint32)
     for axis, stride in enumerate(strides):
-        count += jax.lax.broadcasted_iota(jnp.uint32, tuple(shape), axis) * stride
+        places = jax.lax.broadcasted_iota(jnp.uint32, tuple(size), axis)
+        count += (places + jnp.asarray(start[axis], jnp.uint32)) * stride
     first, second = threefry2x32(jax.random.key_data(key), jnp.zeros_like(count), count)
     return first ^ second
 

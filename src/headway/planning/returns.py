@@ -2,16 +2,21 @@
 
 import dataclasses
 import functools
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from headway.config import PlannerConfig
-from headway.planning.devices import Devices, environments_at_once, spread_candidates
+from headway.planning.devices import (
+    SHARE_BUDGET,
+    Devices,
+    environments_at_once,
+    spread_candidates,
+)
 from headway.planning.imagination import over_rows
-from headway.planning.noise import normal
+from headway.planning.noise import normal_block
 from headway.tasks.base import Task
 
 
@@ -96,6 +101,23 @@ class Dynamics(Protocol):
         ...
 
 
+@runtime_checkable
+class Ensemble(Dynamics, Protocol):
+    """A `Dynamics` of several members that can also be imagined one by one."""
+
+    def of_member(self, member: Int[Array, ""]) -> "Dynamics":
+        """The dynamics of one member, whose arrays keep that axis; called after `of_env`."""
+        ...
+
+
+class Share(NamedTuple):
+    """Which of all candidates are imagined here, by a program that has one core for itself."""
+
+    first: Int[Array, ""]
+    total: int
+    """How many candidates there are; noise is drawn for each as it is with all of them."""
+
+
 def candidate_returns(
     dynamics: Dynamics,
     task: Task,
@@ -104,6 +126,7 @@ def candidate_returns(
     *,
     settings: RolloutSettings,
     key: PRNGKeyArray,
+    share: Share | None = None,
 ) -> Float[Array, "env candidate"]:
     """Mean return of each candidate over its particles, each staying with one member (TS∞).
 
@@ -119,16 +142,21 @@ def candidate_returns(
         candidates: Action sequences in [-1, 1].
         settings: What else fixes the rollouts.
         key: Draws the noise of the rollouts.
+        share: Which candidates these are, if they are not all.
     """
     num_envs, num_candidates = candidates.shape[:2]
     keys = jax.vmap(functools.partial(jax.random.fold_in, key))(jnp.arange(num_envs))
+    rows = num_candidates * settings.particles_per_member * dynamics.num_members
+    bytes_per_env = 4 * dynamics.widest * rows
+    budget = None if share is None else SHARE_BUDGET
+    at_once = environments_at_once(num_envs, bytes_per_env, budget)
+    one_by_one = budget is not None and bytes_per_env > budget
 
     def of_one(part, obs, candidates, key):
         one = dynamics.of_env(part)
-        return _environment_returns(one, task, obs, candidates, settings=settings, key=key)
+        rollouts = _Rollouts(one, task, obs, candidates, settings, key, share)
+        return rollouts.returns(one_by_one=one_by_one)
 
-    rows = num_candidates * settings.particles_per_member * dynamics.num_members
-    at_once = environments_at_once(num_envs, 4 * dynamics.widest * rows)
     args: tuple[Any, Array, Array, PRNGKeyArray] = (dynamics.per_env, obs, candidates, keys)
     if at_once == num_envs:
         return jax.vmap(of_one)(*args)
@@ -169,61 +197,104 @@ def follow(
     return jax.vmap(of_one)(dynamics.per_env, obs, actions).transpose(2, 0, 1, 3)
 
 
-def _environment_returns(
-    dynamics: Dynamics,
-    task: Task,
-    obs: Float[Array, " obs"],
-    candidates: Float[Array, "candidate horizon action"],
-    *,
-    settings: RolloutSettings,
-    key: PRNGKeyArray,
-) -> Float[Array, " candidate"]:
-    """`candidate_returns` of one environment; layout as in `imagination`."""
-    num_candidates, horizon, action_size = candidates.shape
-    members, particles = dynamics.num_members, settings.particles_per_member
-    rows = members, particles, num_candidates
-    reward_of = task.released_reward if settings.released_reward else task.reward
-    reward_of, terminated = over_rows(reward_of), over_rows(task.terminated)
-    scale_action = over_rows(task.scale_action)
-    spread = functools.partial(spread_candidates, devices=settings.devices)
+class _Rollouts(NamedTuple):
+    """All that the rollouts of one environment are made of; layout as in `imagination`."""
 
-    # On CPUs XLA would draw noise again for every operation of a step that uses it, so it is
-    # drawn before the rollout. Elsewhere that would take too much memory.
-    independent = dynamics.stochastic and not settings.shared_noise
-    step_by_step = independent and jax.default_backend() != "cpu"
+    dynamics: Dynamics
+    task: Task
+    obs: Float[Array, " obs"]
+    candidates: Float[Array, "candidate horizon action"]
+    settings: RolloutSettings
+    key: PRNGKeyArray
+    share: Share | None
 
-    def imagine(carry, step):
-        obs, alive, total, memory = carry
-        scaled, noise = step
-        scaled = spread(jnp.broadcast_to(scaled[:, None], (members, action_size, *rows[1:])))
-        noise = draw(noise) if step_by_step else noise
-        memory, next_obs = dynamics.step(task, memory, obs, scaled, noise)
-        action = scale_action(scaled)
-        total = total + jnp.where(alive, reward_of(obs, action, next_obs), 0.0)
-        alive = alive & ~terminated(obs, action, next_obs)
-        return (next_obs, alive, total, memory), None
+    def returns(self, *, one_by_one: bool) -> Float[Array, " candidate"]:
+        """`candidate_returns` of this environment.
 
-    def draw(key):
-        return spread(normal(key, (members, obs.shape[0], particles, num_candidates)))
+        Args:
+            one_by_one: Whether members that can be are imagined one after the other, so that
+                what one of them computes stays in the caches. The noise is the same.
+        """
+        dynamics = self.dynamics
+        if one_by_one and dynamics.num_members > 1 and isinstance(dynamics, Ensemble):
+            members = jnp.arange(dynamics.num_members)
+            total = jax.lax.map(lambda i: self._totals(dynamics.of_member(i), i)[0], members)
+        else:
+            total = self._totals(dynamics, jnp.zeros((), jnp.int32))
+        mean = total.mean((0, 1))
+        if not self.settings.risk_aversion:
+            return mean
+        return mean - self.settings.risk_aversion * total.std((0, 1))
 
-    def noise_of_steps():
-        if not dynamics.stochastic:
+    def _totals(
+        self, dynamics: Dynamics, member: Int[Array, ""]
+    ) -> Float[Array, "member particle candidate"]:
+        """The return of every rollout of some members, from one of them on."""
+        num_candidates, _, action_size = self.candidates.shape
+        members, particles = dynamics.num_members, self.settings.particles_per_member
+        rows = members, particles, num_candidates
+        task, spread = self.task, self._spread
+        reward_of = task.released_reward if self.settings.released_reward else task.reward
+        reward_of, terminated = over_rows(reward_of), over_rows(task.terminated)
+        scale_action = over_rows(task.scale_action)
+
+        def imagine(carry, step):
+            obs, alive, total, memory = carry
+            scaled, noise = step
+            scaled = spread(jnp.broadcast_to(scaled[:, None], (members, action_size, *rows[1:])))
+            noise = self._drawn(noise, members, member)
+            memory, next_obs = dynamics.step(task, memory, obs, scaled, noise)
+            action = scale_action(scaled)
+            total = total + jnp.where(alive, reward_of(obs, action, next_obs), 0.0)
+            alive = alive & ~terminated(obs, action, next_obs)
+            return (next_obs, alive, total, memory), None
+
+        def wide(values):
+            shape = members, values.shape[-1], *rows[1:]
+            return spread(jnp.broadcast_to(values[..., None, None], shape))
+
+        memory = jax.tree.map(wide, dynamics.start())
+        carry = wide(self.obs), jnp.ones(rows, bool), jnp.zeros(rows), memory
+        steps = self.candidates.transpose(1, 2, 0), self._noise_of_steps(members, member)
+        (_, _, total, _), _ = jax.lax.scan(imagine, carry, steps)
+        return total
+
+    def _noise_of_steps(self, members: int, member: Int[Array, ""]) -> Array | None:
+        """The noise of all steps, or keys to draw it with.
+
+        On a CPU it is drawn before the rollout, because XLA draws it several times over wherever
+        several operations of a step use it. Elsewhere that would take too much memory.
+        """
+        if not self.dynamics.stochastic:
             return None
-        if settings.shared_noise:
-            shape = horizon, members, obs.shape[0], particles
-            return jax.random.normal(key, shape)[..., None]
-        keys = jax.random.split(key, horizon)
-        return keys if step_by_step else jax.vmap(draw)(keys)
+        horizon, particles = self.candidates.shape[1], self.settings.particles_per_member
+        if self.settings.shared_noise:
+            shape = horizon, self.dynamics.num_members, self.obs.shape[0], particles
+            shared = jax.random.normal(self.key, shape)[..., None]
+            return jax.lax.dynamic_slice_in_dim(shared, member, members, axis=1)
+        keys = jax.random.split(self.key, horizon)
+        if jax.default_backend() != "cpu":
+            return keys
+        return jax.vmap(lambda key: self._draw(key, members, member))(keys)
 
-    def wide(values):
-        return spread(
-            jnp.broadcast_to(values[..., None, None], (members, values.shape[-1], *rows[1:]))
-        )
+    def _drawn(
+        self, step: Array | None, members: int, member: Int[Array, ""]
+    ) -> Float[Array, "member obs particle #candidate"] | None:
+        """The noise of one step, drawn now if it is not yet."""
+        if step is None or jnp.issubdtype(step.dtype, jnp.floating):
+            return step
+        return self._draw(step, members, member)
 
-    memory = jax.tree.map(wide, dynamics.start())
-    carry = wide(obs), jnp.ones(rows, bool), jnp.zeros(rows), memory
-    steps = candidates.transpose(1, 2, 0), noise_of_steps()
-    (_, _, total, _), _ = jax.lax.scan(imagine, carry, steps)
-    if not settings.risk_aversion:
-        return total.mean((0, 1))
-    return total.mean((0, 1)) - settings.risk_aversion * total.std((0, 1))
+    def _draw(
+        self, key: PRNGKeyArray, members: int, member: Int[Array, ""]
+    ) -> Float[Array, "member obs particle candidate"]:
+        """One step's noise of some members and candidates, as it is with all of them."""
+        here, obs_size = len(self.candidates), self.obs.shape[0]
+        first, total = self.share or (0, here)
+        particles = self.settings.particles_per_member
+        whole = self.dynamics.num_members, obs_size, particles, total
+        start, size = (member, 0, 0, first), (members, obs_size, particles, here)
+        return self._spread(normal_block(key, whole, start, size))
+
+    def _spread(self, x: Array) -> Array:
+        return spread_candidates(x, self.settings.devices)

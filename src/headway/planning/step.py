@@ -1,4 +1,4 @@
-"""One step of an agent that plans: prepare, search for the best action sequence, decide."""
+"""What a step of an agent that plans is made of: prepare, search, decide."""
 
 from typing import Any, Protocol, runtime_checkable
 
@@ -6,9 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.config import PlannerConfig
-from headway.models.compilation import jit_networks
 from headway.planning.acting import Acting, Decision
-from headway.planning.devices import brought_to_each, whole_on_each
+from headway.planning.devices import whole_on_each
 from headway.planning.optimizers import Plan, Score, SearchState, make_optimizer
 from headway.planning.returns import Dynamics, RolloutSettings, candidate_returns
 from headway.tasks.base import Task
@@ -70,26 +69,6 @@ def scoring(
         return candidate_returns(dynamics, task, obs, candidates, settings=settings, key=key)
 
     return score
-
-
-def act(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[Any, Decision]:
-    """One whole step, compiled."""
-    compiled = _act_bfloat16 if agent.planner.precision == "bfloat16" else _act_float32
-    state = brought_to_each(state, agent.planner.devices)
-    return compiled(agent, state, jnp.asarray(obs, jnp.float32))
-
-
-def _act(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[Any, Decision]:
-    prepared = agent.prepare(state, obs)
-    # Imagine candidates, and search for the best action sequence.
-    score = scoring(agent.task, agent.planner, prepared.dynamics, obs)
-    optimizer = make_optimizer(agent.planner)
-    plan = optimizer.optimize(score, state.search, key=prepared.plan_key)
-    return whole_on_each(agent.decide(state, obs, prepared, plan), agent.planner.devices)
-
-
-_act_float32 = jit_networks(_act)
-_act_bfloat16 = jit_networks(_act, precision="bfloat16")
 
 
 def hold(planner: PlannerConfig, state: Any) -> Any:

@@ -15,7 +15,7 @@ from headway.planning.heads import RecentTransitions
 from headway.planning.meta.models import AdaptiveModel, Transition
 from headway.planning.optimizers import Plan, SearchState, make_optimizer
 from headway.planning.returns import Dynamics, follow
-from headway.planning.step import act
+from headway.planning.search import act
 from headway.tasks.base import Task
 
 

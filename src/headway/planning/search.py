@@ -1,0 +1,148 @@
+"""One step of an agent that plans, compiled: as one program, or iteration by iteration.
+
+One program is what several devices share, and what costs least to call. Iteration by iteration
+a search can be cut off, and the cores of a CPU can share its candidates.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from headway.models.compilation import jit_networks
+from headway.planning.acting import Decision
+from headway.planning.devices import brought_to_each, whole_on_each
+from headway.planning.optimizers import Optimizer, make_optimizer
+from headway.planning.shares import Question, joined, returns_of_shares, worth_sharing
+from headway.planning.step import Planning, scoring
+
+
+class Begun(NamedTuple):
+    """A step whose search is under way."""
+
+    prepared: Any
+    """What is known before the search."""
+    obs: Float[Array, "env obs"]
+    keys: list[PRNGKeyArray]
+    """One for each iteration."""
+
+
+def act(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[Any, Decision]:
+    """One whole step."""
+    if worth_sharing(agent.planner, obs):
+        return _act_by_iteration(agent, state, obs)
+    state = brought_to_each(state, agent.planner.devices)
+    return _compiled(agent, "act")(agent, state, obs)
+
+
+def _act_by_iteration(
+    agent: Planning, state: Any, obs: Float[Array, "env obs"]
+) -> tuple[Any, Decision]:
+    planner = agent.planner
+    begun, search = begin(agent, state, obs)
+    for iteration in range(planner.num_iterations):
+        search, settled = iterate(agent, begun, search, iteration)
+        if planner.settle_tolerance and settled.all():
+            break
+    return end(agent, state, begun, search)
+
+
+def begin(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[Begun, Any]:
+    """All of a step that comes before its first iteration, and the search as it is then."""
+    state = brought_to_each(state, agent.planner.devices)
+    return _compiled(agent, "begin")(agent, state, obs)
+
+
+def iterate(
+    agent: Planning, begun: Begun, search: Any, iteration: int
+) -> tuple[Any, Bool[Array, " env"]]:
+    """The search after another iteration, and where it needs no further one."""
+    planner, optimizer = agent.planner, make_optimizer(agent.planner)
+    kind, key = optimizer.kind(iteration), begun.keys[iteration]
+    if not worth_sharing(planner, begun.obs):
+        return _compiled(agent, "iterate")(agent, begun.prepared, begun.obs, search, key, kind)
+    candidates, score_key = _compiled(agent, "ask")(optimizer, search, key, kind)
+    question = Question(begun.prepared.dynamics, agent.task, begun.obs, candidates, score_key)
+    shares = returns_of_shares(question, planner)
+    return _compiled(agent, "tell")(optimizer, search, candidates, shares)
+
+
+def end(agent: Planning, state: Any, begun: Begun, search: Any) -> tuple[Any, Decision]:
+    """The decision, by the search as it is now."""
+    return _compiled(agent, "end")(agent, state, begun.obs, begun.prepared, search)
+
+
+def act_in_one(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[Any, Decision]:
+    """One whole step, not compiled yet."""
+    prepared = agent.prepare(state, obs)
+    # Imagine candidates, and search for the best action sequence.
+    score = scoring(agent.task, agent.planner, prepared.dynamics, obs)
+    optimizer = make_optimizer(agent.planner)
+    plan = optimizer.optimize(score, state.search, key=prepared.plan_key)
+    return whole_on_each(agent.decide(state, obs, prepared, plan), agent.planner.devices)
+
+
+def _begin(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[Begun, Any]:
+    prepared = agent.prepare(state, obs)
+    optimizer = make_optimizer(agent.planner)
+    keys = jax.random.split(prepared.plan_key, optimizer.num_iterations)
+    begun = Begun(prepared, obs, list(keys)), optimizer.begin(state.search)
+    return whole_on_each(begun, agent.planner.devices)
+
+
+def _iterate(
+    agent: Planning,
+    prepared: Any,
+    obs: Float[Array, "env obs"],
+    search: Any,
+    key: PRNGKeyArray,
+    iteration: int,
+) -> tuple[Any, Bool[Array, " env"]]:
+    optimizer = make_optimizer(agent.planner)
+    score = scoring(agent.task, agent.planner, prepared.dynamics, obs)
+    search = optimizer.iterate(score, search, key, iteration)
+    return whole_on_each((search, optimizer.settled(search)), agent.planner.devices)
+
+
+def _ask(
+    optimizer: Optimizer, search: Any, key: PRNGKeyArray, iteration: int
+) -> tuple[Float[Array, "env candidate horizon action"], PRNGKeyArray]:
+    """The first half of `Optimizer.iterate`, with the key that the second half draws with."""
+    ask_key, score_key = jax.random.split(key)
+    return optimizer.ask(search, ask_key, iteration), score_key
+
+
+def _tell(
+    optimizer: Optimizer,
+    search: Any,
+    candidates: Float[Array, "env candidate horizon action"],
+    shares: list[Float[Array, "env share"]],
+) -> tuple[Any, Bool[Array, " env"]]:
+    search = optimizer.tell(search, candidates, joined(shares, candidates.shape[1]))
+    return search, optimizer.settled(search)
+
+
+def _end(
+    agent: Planning, state: Any, obs: Float[Array, "env obs"], prepared: Any, search: Any
+) -> tuple[Any, Decision]:
+    plan = make_optimizer(agent.planner).end(search)
+    return whole_on_each(agent.decide(state, obs, prepared, plan), agent.planner.devices)
+
+
+_PARTS = {
+    "act": act_in_one,
+    "begin": _begin,
+    "iterate": _iterate,
+    "ask": _ask,
+    "tell": _tell,
+    "end": _end,
+}
+_COMPILED = {
+    (name, precision): jit_networks(function, precision=precision)
+    for name, function in _PARTS.items()
+    for precision in ("float32", "bfloat16")
+}
+
+
+def _compiled(agent: Planning, name: str) -> Any:
+    return _COMPILED[name, agent.planner.precision]
