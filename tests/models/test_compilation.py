@@ -35,6 +35,18 @@ def test_compiled_functions_are_kept_in_the_users_cache_folder(tmp_path):
     assert not run_program(tmp_path / "off", JAX_ENABLE_COMPILATION_CACHE="0")
 
 
+@pytest.mark.parametrize(("chosen", "kept"), [(None, 0.05), ("1.0", 1.0), ("0.3", 0.3)])
+def test_short_compilations_are_kept_too_unless_the_user_says_otherwise(chosen, kept):
+    name = "jax_persistent_cache_min_compile_time_secs"
+    program = f"import headway.models.compilation, jax; print(jax.config.{name})"
+    env = {key: value for key, value in os.environ.items() if key != name.upper()}
+    env |= {} if chosen is None else {name.upper(): chosen}
+    found = subprocess.run(
+        [sys.executable, "-c", program], check=True, env=env, capture_output=True
+    )
+    assert float(found.stdout) == kept
+
+
 def test_an_option_that_this_xla_does_not_know_is_left_out(monkeypatch):
     wanted = {"float32": ({"xla_no_such_option": 1}, {"xla_cpu_prefer_vector_width": 512})}
     monkeypatch.setattr(compilation, "_WANTED", wanted)

@@ -1,6 +1,7 @@
 """How functions that run the networks are compiled, and where compiled ones are kept."""
 
 import functools
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +16,8 @@ from headway.models.meeting import Program, seat_here
 _WIDE_VECTORS = {"xla_cpu_prefer_vector_width": 512}
 _NO_FUSIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
 _WANTED = {"float32": (_WIDE_VECTORS, _NO_FUSIONS), "bfloat16": (_WIDE_VECTORS,)}
+_JAX_KEEPS, _KEPT = 1.0, 0.05
+"""Seconds that a program must take to compile to be kept: JAX's default, and ours."""
 
 
 @functools.cache
@@ -59,12 +62,17 @@ def keep_compilations() -> None:
 
     It lies in the user's cache folder; `JAX_COMPILATION_CACHE_DIR` moves it and
     `JAX_ENABLE_COMPILATION_CACHE=0` turns it off. JAX looks once, at its first compilation:
-    that is why this runs on import.
+    that is why this runs on import. A step is several programs, none of which takes the second
+    to compile from which JAX would keep them, so shorter ones are kept, unless
+    `JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS` says otherwise.
     """
     settings: Any = jax.config  # JAX declares its settings while running
     if settings.jax_compilation_cache_dir is None:
         folder = platformdirs.user_cache_path("headway", appauthor=False) / "compiled"
         jax.config.update("jax_compilation_cache_dir", str(folder))
+    name = "jax_persistent_cache_min_compile_time_secs"
+    if getattr(settings, name) == _JAX_KEEPS and name.upper() not in os.environ:
+        jax.config.update(name, _KEPT)
 
 
 keep_compilations()
