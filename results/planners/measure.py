@@ -54,6 +54,8 @@ def planners(own: PlannerConfig, num_members: int) -> dict[str, Settings]:
         "cem": {},
         "paper": paper,
         "fast": fast,
+        "fast, 4 iterations": fast | {"num_iterations": 4},
+        "fast, 133 candidates": fast | {"num_candidates": 133, "num_elites": 27},
         **by_color(fast),
         "cem, 1/2 of the candidates": fewer(own, 2),
         "cem, 1/4 of the candidates": fewer(own, 4),
