@@ -77,10 +77,10 @@ def on_devices(number, settings):
     return np.array(json.loads(found)), int(num_devices)
 
 
-def printed_by(worker):
-    """What a Python has printed once it has ended well."""
+def printed_by(worker, seconds=120):
+    """What a Python has printed once it has ended well, in time."""
     try:
-        out, errors = worker.communicate(timeout=120)
+        out, errors = worker.communicate(timeout=seconds)
     finally:
         worker.kill()
     assert worker.returncode == 0, errors[-2000:]

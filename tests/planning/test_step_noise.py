@@ -5,7 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from headway.planning.noise import normal, normal_block, threefry2x32
+from headway.planning.noise import normal_block, threefry2x32
+
+
+def normal(key, shape):
+    return normal_block(key, shape, [0] * len(shape), shape)
 
 
 @pytest.mark.parametrize("shape", [(1,), (3,), (2, 7, 3), (5, 4, 2, 25), (1, 1, 1, 1)])

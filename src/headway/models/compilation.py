@@ -63,8 +63,8 @@ def keep_compilations() -> None:
     It lies in the user's cache folder; `JAX_COMPILATION_CACHE_DIR` moves it and
     `JAX_ENABLE_COMPILATION_CACHE=0` turns it off. JAX looks once, at its first compilation:
     that is why this runs on import. A step is several programs, none of which takes the second
-    to compile from which JAX would keep them, so shorter ones are kept, unless
-    `JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS` says otherwise.
+    to compile from which JAX would keep them, so all programs of 0.05 s are kept, in any folder,
+    unless `JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS` says otherwise.
     """
     settings: Any = jax.config  # JAX declares its settings while running
     if settings.jax_compilation_cache_dir is None:

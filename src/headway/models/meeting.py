@@ -60,10 +60,16 @@ class Program:
 
     def __init__(self, function: Callable, options: Callable[[], dict[str, Any]]):
         self._function, self._options = function, options
+        self._wrapping = threading.Lock()
+
+    @property
+    def alone(self) -> Callable:
+        """The function itself, compiled; whichever threads ask first, there is one."""
+        with self._wrapping:
+            return self._alone
 
     @functools.cached_property
-    def alone(self) -> Callable:
-        """The function itself, compiled."""
+    def _alone(self) -> Callable:
         return eqx.filter_jit(self._function, **self._options())
 
     @functools.cached_property

@@ -1,4 +1,4 @@
-"""Planning until a deadline: one iteration of the optimizer per compiled call.
+"""Planning until a deadline: one iteration of the optimizer after the other.
 
 Between two iterations the clock is read, and another one begins only if the slowest of the
 last ones would still fit. So the answer is late only where a part takes longer than it lately

@@ -19,11 +19,6 @@ _WORDS = 2**32
 """Draws after which the second word of the counter would begin."""
 
 
-def normal(key: PRNGKeyArray, shape: Sequence[int]) -> Float[Array, "*shape"]:
-    """`jax.random.normal(key, shape)`, of any of JAX's generators."""
-    return normal_block(key, shape, [0] * len(shape), shape)
-
-
 def normal_block(
     key: PRNGKeyArray,
     shape: Sequence[int],

@@ -48,7 +48,10 @@ class RolloutSettings:
 
 @runtime_checkable
 class Dynamics(Protocol):
-    """What one plan imagines with; arrays are [member, feature, particle, candidate]."""
+    """What one plan imagines with: a pytree, since it goes from one program to the next.
+
+    Arrays are [member, feature, particle, candidate].
+    """
 
     @property
     def num_members(self) -> int:

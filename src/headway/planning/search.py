@@ -7,13 +7,14 @@ a search can be cut off, and the cores of a CPU can share its candidates.
 from typing import Any, NamedTuple
 
 import jax
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from headway.models.compilation import jit_networks
 from headway.planning.acting import Decision
 from headway.planning.devices import brought_to_each, whole_on_each
 from headway.planning.optimizers import Optimizer, make_optimizer
-from headway.planning.shares import Question, joined, returns_of_shares, worth_sharing
+from headway.planning.shares import Question, joined, num_shares, returns_of_shares
 from headway.planning.step import Planning, scoring
 
 
@@ -29,7 +30,7 @@ class Begun(NamedTuple):
 
 def act(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[Any, Decision]:
     """One whole step."""
-    if worth_sharing(agent.planner, obs):
+    if num_shares(agent.planner, len(obs)) > 1 and not _traced((agent, state, obs)):
         return _act_by_iteration(agent, state, obs)
     state = brought_to_each(state, agent.planner.devices)
     return _compiled(agent, "act")(agent, state, obs)
@@ -59,12 +60,13 @@ def iterate(
     """The search after another iteration, and where it needs no further one."""
     planner, optimizer = agent.planner, make_optimizer(agent.planner)
     kind, key = optimizer.kind(iteration), begun.keys[iteration]
-    if not worth_sharing(planner, begun.obs):
+    shares = num_shares(planner, len(begun.obs))
+    if shares == 1:
         return _compiled(agent, "iterate")(agent, begun.prepared, begun.obs, search, key, kind)
     candidates, score_key = _compiled(agent, "ask")(optimizer, search, key, kind)
     question = Question(begun.prepared.dynamics, agent.task, begun.obs, candidates, score_key)
-    shares = returns_of_shares(question, planner)
-    return _compiled(agent, "tell")(optimizer, search, candidates, shares)
+    returns = returns_of_shares(question, planner, shares)
+    return _compiled(agent, "tell")(optimizer, search, candidates, returns)
 
 
 def end(agent: Planning, state: Any, begun: Begun, search: Any) -> tuple[Any, Decision]:
@@ -116,9 +118,9 @@ def _tell(
     optimizer: Optimizer,
     search: Any,
     candidates: Float[Array, "env candidate horizon action"],
-    shares: list[Float[Array, "env share"]],
+    returns: list[Float[Array, "env share"]],
 ) -> tuple[Any, Bool[Array, " env"]]:
-    search = optimizer.tell(search, candidates, joined(shares, candidates.shape[1]))
+    search = optimizer.tell(search, candidates, joined(returns, candidates.shape[1]))
     return search, optimizer.settled(search)
 
 
@@ -142,6 +144,11 @@ _COMPILED = {
     for name, function in _PARTS.items()
     for precision in ("float32", "bfloat16")
 }
+
+
+def _traced(tree: Any) -> bool:
+    """Whether a call is part of another program, which other threads know nothing of."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def _compiled(agent: Planning, name: str) -> Any:

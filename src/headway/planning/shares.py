@@ -6,13 +6,13 @@ its core, and meet once per iteration of the optimizer.
 """
 
 import functools
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from headway.config import PlannerConfig
@@ -22,26 +22,24 @@ from headway.models.meeting import seat_here
 from headway.planning.returns import Dynamics, RolloutSettings, Share, candidate_returns
 from headway.tasks.base import Task
 
-LEAST = 10_000
-"""Imagined steps of an iteration below which to share them costs more than it saves."""
+LEAST = 5_000
+"""Imagined steps of an iteration that a share must have to be worth its while."""
 
 
-def worth_sharing(planner: PlannerConfig, obs: Any) -> bool:
-    """Whether cores share the candidates of a plan.
+def num_shares(planner: PlannerConfig, num_envs: int) -> int:
+    """Into how many shares the candidates of a plan are divided; 1 where they are not.
 
-    They do on a CPU that is one device, in a run by itself; where JAX has several devices, these
+    They are on a CPU that is one device, in a run by itself: where JAX has several devices, these
     share the candidates (`devices.spread_candidates`), and runs that meet share the cores.
 
     Args:
         planner: Settings of the planner.
-        obs: Where each environment is; being traced, it is part of a program already.
+        num_envs: Environments that are planned for.
     """
-    if isinstance(obs, Tracer) or seat_here() is not None:
-        return False
-    if jax.default_backend() != "cpu" or jax.device_count() > 1 or num_cpus() == 1:
-        return False
-    steps = len(obs) * planner.num_candidates * planner.num_particles * planner.horizon
-    return steps >= LEAST
+    if seat_here() is not None or jax.default_backend() != "cpu" or jax.device_count() > 1:
+        return 1
+    steps = num_envs * planner.num_candidates * planner.num_particles * planner.horizon
+    return max(1, min(num_cpus(), steps // LEAST))
 
 
 class Question(NamedTuple):
@@ -55,23 +53,38 @@ class Question(NamedTuple):
 
 
 def returns_of_shares(
-    question: Question, planner: PlannerConfig
+    question: Question, planner: PlannerConfig, shares: int
 ) -> list[Float[Array, "env share"]]:
-    """The returns of candidates, in shares of one size; `joined` puts them together."""
+    """The returns of candidates, in shares of one size; `joined` puts them together.
+
+    Settings of JAX that a context manager makes for this thread do not reach the others.
+
+    Args:
+        question: Is a pytree of arrays and of what can be compared.
+        planner: Settings of the planner.
+        shares: Into how many to divide the candidates, at most.
+    """
     total = question.candidates.shape[1]
-    size = -(-total // num_cpus())
+    size = -(-total // shares)
     compiled = _COMPILED[planner.precision]
     settings = RolloutSettings.of(planner, question.dynamics.num_members)
 
     def of_share(first):
         start = np.int32(min(first, total - size))
-        return compiled(question, start, size=size, settings=settings)
+        return jax.block_until_ready(compiled(question, start, size=size, settings=settings))
 
-    def wait_for_share(first):
-        return jax.block_until_ready(of_share(first))
+    others = [(first, _begun(of_share, first)) for first in range(size, total, size)]
+    here = of_share(0)
+    # What no thread has begun by now, because all are busy with other plans, is done here.
+    return [here, *(of_share(i) if future.cancel() else future.result() for i, future in others)]
 
-    others = [_threads().submit(wait_for_share, first) for first in range(size, total, size)]
-    return [of_share(0), *(other.result() for other in others)]
+
+def _begun(of_share: Callable[[int], Any], first: int) -> Future:
+    """A share that another thread computes, or that can be cancelled."""
+    try:
+        return _threads().submit(of_share, first)
+    except RuntimeError:  # the interpreter is ending, and starts no more threads
+        return Future()
 
 
 def joined(shares: list[Float[Array, "env share"]], total: int) -> Float[Array, "env candidate"]:

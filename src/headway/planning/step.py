@@ -49,7 +49,7 @@ class Planning(Acting, Protocol):
         ...
 
     def prepare(self, state: Any, obs: Float[Array, "env obs"]) -> Any:
-        """Everything of a step that comes before its search; returns what is `Known`."""
+        """Everything of a step that comes before its search: what is `Known`, as a pytree."""
         ...
 
     def decide(
