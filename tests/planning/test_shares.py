@@ -69,16 +69,15 @@ def test_a_search_ends_when_all_environments_are_settled(sharing, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("cores", "budget", "settings"),
+    ("cores", "budget", "settings", "kind"),
     [
-        (2, ONE_BY_ONE, {}),
-        (2, ONE_BY_ONE, {"particle_noise": "shared", "risk_aversion": 1.0}),
-        (4, returns.SHARE_BUDGET, {"particle_noise": "shared"}),
-        (7, returns.SHARE_BUDGET, {}),
-        (40, ONE_BY_ONE, {}),
+        (2, ONE_BY_ONE, {}, "doubt"),
+        (2, ONE_BY_ONE, {"particle_noise": "shared", "risk_aversion": 1.0}, "head"),
+        (4, returns.SHARE_BUDGET, {"particle_noise": "shared"}, "last-hidden"),
+        (7, returns.SHARE_BUDGET, {}, "head"),
+        (40, ONE_BY_ONE, {}, "last-hidden"),
     ],
 )
-@pytest.mark.parametrize("kind", ["head", "last-hidden", "doubt"])
 def test_shares_have_the_returns_of_the_whole(cores, budget, settings, kind, monkeypatch):
     monkeypatch.setattr(returns, "SHARE_BUDGET", budget)
     monkeypatch.setattr(shares, "_COMPILED", compiled_anew())  # for this budget
