@@ -44,7 +44,12 @@ def reference(tmp_path_factory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("env", env_names())
+def marked(env: str):
+    """Other methods run on these by default (`test_every_pair`, `test_adaptive_methods`)."""
+    return pytest.param(env, marks=pytest.mark.slow if env in ("hopper", "slim-humanoid") else ())
+
+
+@pytest.mark.parametrize("env", [marked(env) for env in env_names()])
 def test_smoke_run_and_evaluation_of_every_unseen_group(env, tmp_path):
     run = headway.train(env, preset="smoke", seed=1, run_dir=tmp_path / env)
     assert [m["iteration"] for m in run.metrics] == [0, 1]

@@ -63,7 +63,14 @@ print(len(state.search.guess.sharding.device_set))
 """
 
 
-@pytest.mark.parametrize("settings", [{}, {"particle_noise": "shared"}, {"num_candidates": 42}])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        pytest.param({"particle_noise": "shared"}, marks=pytest.mark.slow),
+        {"num_candidates": 42},
+    ],
+)
 def test_four_devices_choose_the_actions_of_one(settings):
     (one, num_one), (four, num_four) = (on_devices(number, settings) for number in (1, 4))
     assert (num_one, num_four) == (1, 4)
@@ -177,7 +184,7 @@ def resident_kib():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-@pytest.mark.parametrize("plans", [3_000, pytest.param(10_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("plans", [2_000, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_thousands_of_plans_take_no_more_memory(plans):
     agent = make_agent(num_candidates=8, num_elites=2, num_iterations=1, num_particles=2, horizon=2)
     state = agent.init(1, key=jax.random.key(0))
