@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from headway.experiment.methods import register_method as register_method
     from headway.experiment.presets import PRESETS as PRESETS
     from headway.models.dynamics import MultiHeadDynamics as MultiHeadDynamics
-    from headway.models.fitting import EpochStats as EpochStats
+    from headway.models.updates import EpochStats as EpochStats
     from headway.planning.agent import Agent as Agent
     from headway.planning.controller import Controller as Controller
     from headway.planning.meta.agent import AdaptiveAgent as AdaptiveAgent

@@ -20,7 +20,8 @@ from headway.experiment.diagnostics import head_shares
 from headway.experiment.methods import make_config
 from headway.models import fitting
 from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.models.fitting import EpochStats, FitSetup, fit_epoch, make_data
+from headway.models.fitting import FitSetup, fit_epoch, make_data
+from headway.models.updates import EpochStats
 from headway.planning.agent import Agent
 from headway.tasks.catalog import env_names, env_spec
 

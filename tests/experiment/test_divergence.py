@@ -14,7 +14,7 @@ from headway.errors import DivergenceError
 from headway.experiment import loading, training
 from headway.experiment.divergence import divergence, first_non_finite
 from headway.experiment.learners import Learned, multi_headed
-from headway.models.fitting import EpochStats
+from headway.models.updates import EpochStats
 from headway.storage.interrupts import Terminated
 
 sys.path.append(str(Path(__file__).parent.parent / "chaos"))

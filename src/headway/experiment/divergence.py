@@ -6,7 +6,7 @@ import numpy as np
 
 from headway.data import Trajectory
 from headway.errors import DivergenceError
-from headway.models.fitting import EpochStats
+from headway.models.updates import EpochStats
 
 MAX_SKIPPED = 0.5
 """Share of an epoch's updates that may be skipped because their loss or gradient is not finite."""

@@ -25,7 +25,8 @@ from headway.experiment.rollouts import (
     Rollout,
     run_episodes,
 )
-from headway.models.fitting import EpochStats, FitState
+from headway.models.fitting import FitState
+from headway.models.updates import EpochStats
 from headway.storage.arrays import tree_arrays, tree_from_arrays
 from headway.storage.files import damaged
 from headway.storage.progress_store import Part, ProgressStore

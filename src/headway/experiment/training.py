@@ -37,7 +37,7 @@ from headway.experiment.rollouts import (
     random_policy,
 )
 from headway.experiment.tensorboard import write_tensorboard
-from headway.models.fitting import EpochStats
+from headway.models.updates import EpochStats
 from headway.planning.acting import Acting
 from headway.storage import arrays
 from headway.storage.interrupts import StopRequest, stop_requests

@@ -16,9 +16,9 @@ from headway.config import FittingConfig, ModelConfig
 from headway.data import Episodes
 from headway.models.compilation import jit_networks
 from headway.models.dynamics import Statistics, network_input
-from headway.models.fitting import EpochStats, FitData
+from headway.models.fitting import FitData
 from headway.models.networks import Dense
-from headway.models.updates import Fitted, Tally
+from headway.models.updates import EpochStats, Fitted, Tally
 from headway.tasks.base import Task
 
 

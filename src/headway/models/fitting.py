@@ -28,6 +28,7 @@ from headway.models.losses import (
     oracle_loss,
 )
 from headway.models.relation import add_parts, intervene, relation_gradient, relation_parts
+from headway.models.updates import EpochStats, unless_broken
 from headway.tasks.base import Task
 
 
@@ -52,19 +53,6 @@ class Assignment(NamedTuple):
 
     forward: Int[Array, "member *segment"]
     backward: Int[Array, "member *segment"] | None
-
-
-class EpochStats(NamedTuple):
-    """Averages over the updates of one epoch."""
-
-    loss: Float[Array, ""]
-    """What was minimised, over the updates that were taken."""
-    forward_loss: Float[Array, ""]
-    """The part of it that predicts forwards in time."""
-    skipped: Int[Array, ""]
-    """Updates that were not taken, because a number was not finite."""
-    updates: Int[Array, ""]
-    """All updates, skipped ones included."""
 
 
 class FitData(NamedTuple):
@@ -105,6 +93,22 @@ class FitSetup(eqx.Module):
             return state
         parameters = relation_parts(model)
         return FitState(model, state.optimizer, self.optimizer.init(parameters))
+
+    def step(self, state: FitState, grads: Any, relation_grads: Any) -> FitState:
+        """Take one Adam step.
+
+        Args:
+            state: Before the step.
+            grads: The gradient, laid out as the model.
+            relation_grads: That of the relation loss, laid out as `RelationParts`, if there is one.
+        """
+        changes, optimizer = self.optimizer.update(grads, state.optimizer)
+        model = eqx.apply_updates(state.model, changes)
+        if relation_grads is None:
+            return FitState(model, optimizer)
+        moments: Any = state.relation_optimizer
+        changes, moments = self.optimizer.update(relation_grads, moments)
+        return FitState(add_parts(model, changes), optimizer, moments)
 
 
 def head_losses(
@@ -259,19 +263,14 @@ def update(
         return loss + pull, (forward, similar)
 
     (loss, (forward, similar)), grads = jax.value_and_grad(objective, has_aux=True)(state.model)
-    changes, optimizer = setup.optimizer.update(grads, state.optimizer)
-    stepped = FitState(eqx.apply_updates(state.model, changes), optimizer)
-    finite = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(grads))
+    relation = None, None
     if similar is not None:
         # Both gradients are taken at the same weights, each with an Adam of its own.
         decay = setup.config.weight_decay
-        relation, grads = relation_gradient(state.model, data.statistics, batch, similar, decay)
-        moments: Any = state.relation_optimizer
-        changes, moments = setup.optimizer.update(grads, moments)
-        stepped = FitState(add_parts(stepped.model, changes), stepped.optimizer, moments)
-        finite &= jnp.isfinite(relation) & jnp.isfinite(optax.tree.norm(grads))
-    kept = jax.tree.map(functools.partial(jnp.where, finite), stepped, state)
-    return kept, (jnp.where(finite, loss, 0.0), jnp.where(finite, forward, 0.0), ~finite)
+        relation = relation_gradient(state.model, data.statistics, batch, similar, decay)
+    taken = functools.partial(setup.step, state, grads, relation[1])
+    state, skipped = unless_broken(taken, state, ((loss, grads), relation))
+    return state, (jnp.where(skipped, 0.0, loss), jnp.where(skipped, 0.0, forward), skipped)
 
 
 def of_update(

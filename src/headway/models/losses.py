@@ -6,6 +6,7 @@ Everything is per member: heads compete within a member, never across members.
 from typing import Literal
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from headway.models.dynamics import ContextEncoder, GaussianNet, MultiHeadDynamics, Prediction
@@ -89,8 +90,13 @@ def weight_decay_loss(net: GaussianNet | ContextEncoder) -> Float[Array, ""]:
         heads = [head for head in (net.mean_heads, net.logvar_heads) if head is not None]
     decays = [HIDDEN_DECAY[min(i, len(HIDDEN_DECAY) - 1)] for i in range(len(layers))]
     weighted = [*zip(decays, layers, strict=True), *((HEAD_DECAY, head) for head in heads)]
-    penalties = [c * jnp.square(layer.weight).sum() for c, layer in weighted]
+    penalties = [c * sum_of_squares(layer.weight) for c, layer in weighted]
     return 0.5 * jnp.stack(penalties).sum()
+
+
+def sum_of_squares(values: Float[Array | np.ndarray, "..."]) -> Float[Array, ""]:
+    """As a product, which XLA computes several times faster on a CPU than a sum."""
+    return jnp.vdot(values, values)
 
 
 def model_decay_loss(model: MultiHeadDynamics, *, context: bool) -> Float[Array, ""]:

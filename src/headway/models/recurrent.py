@@ -14,9 +14,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from headway.config import FittingConfig, ModelConfig
 from headway.models.adapted import Window, glorot
 from headway.models.compilation import jit_networks
-from headway.models.fitting import EpochStats, FitData
+from headway.models.fitting import FitData
 from headway.models.networks import Dense
-from headway.models.updates import Fitted, Tally
+from headway.models.updates import EpochStats, Fitted, Tally
 from headway.tasks.base import Task
 
 FORGET_BIAS = 1.0

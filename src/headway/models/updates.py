@@ -1,7 +1,7 @@
-"""One step of an optimiser that never takes a non-finite one."""
+"""Steps of an optimiser, none of which is taken with a number that is not finite."""
 
-import functools
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -9,7 +9,43 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-from headway.models.fitting import EpochStats
+from headway.models.losses import sum_of_squares
+
+State = TypeVar("State")
+
+
+class EpochStats(NamedTuple):
+    """Averages over the updates of one epoch."""
+
+    loss: Float[Array, ""]
+    """What was minimised, over the updates that were taken."""
+    forward_loss: Float[Array, ""]
+    """The part of it that predicts forwards in time."""
+    skipped: Int[Array, ""]
+    """Updates that were not taken, because a number was not finite."""
+    updates: Int[Array, ""]
+    """All updates, skipped ones included."""
+
+
+def unless_broken(
+    step: Callable[[], State], state: State, gradients: Any
+) -> tuple[State, Bool[Array, ""]]:
+    """Take a step, unless a loss or a gradient is not finite.
+
+    A branch, since a choice between old and new numbers costs as much as the step itself: both are
+    read and written again.
+
+    Args:
+        step: The new state.
+        state: The old one.
+        gradients: Losses and gradients, any tree of arrays.
+
+    Returns:
+        The new state or the old one, and whether the step was skipped.
+    """
+    size = sum((sum_of_squares(leaf) for leaf in jax.tree.leaves(gradients)), jnp.zeros(()))
+    broken = ~jnp.isfinite(size)
+    return jax.lax.cond(broken, lambda: state, step), broken
 
 
 class Fitted(NamedTuple):
@@ -31,10 +67,12 @@ class Fitted(NamedTuple):
         Returns:
             The new state, and whether the step was skipped.
         """
-        changes, optimizer = optax.adam(learning_rate).update(grads, self.optimizer)
-        stepped = Fitted(eqx.apply_updates(self.model, changes), optimizer)
-        finite = jnp.isfinite(loss) & jnp.isfinite(optax.tree.norm(grads))
-        return jax.tree.map(functools.partial(jnp.where, finite), stepped, self), ~finite
+
+        def taken() -> Fitted:
+            changes, optimizer = optax.adam(learning_rate).update(grads, self.optimizer)
+            return Fitted(eqx.apply_updates(self.model, changes), optimizer)
+
+        return unless_broken(taken, self, (loss, grads))
 
 
 class Tally(NamedTuple):

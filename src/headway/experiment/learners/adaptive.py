@@ -16,9 +16,9 @@ from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
 from headway.experiment.rollouts import Arena
 from headway.models.adapted import MetaSetup, ReluNet, meta_epoch
 from headway.models.dynamics import Statistics
-from headway.models.fitting import EpochStats, FitData, FitSetup
+from headway.models.fitting import FitData, FitSetup
 from headway.models.recurrent import RecurrentNet, RecurrentSetup, recurrent_epoch
-from headway.models.updates import Fitted
+from headway.models.updates import EpochStats, Fitted
 from headway.planning.meta.agent import AdaptiveAgent, imagine
 from headway.planning.meta.models import AdaptiveModel, GradientAdapted, Recurrent
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, PRNGKeyArray
 from headway.config import Config
 from headway.data import Trajectory
 from headway.experiment.rollouts import Arena
-from headway.models.fitting import EpochStats
+from headway.models.updates import EpochStats
 from headway.planning.acting import Acting
 from headway.settings import override
 from headway.tasks.base import Task

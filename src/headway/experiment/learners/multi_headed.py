@@ -18,7 +18,8 @@ from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
 from headway.experiment.methods import told_sim_params
 from headway.experiment.rollouts import Arena
 from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.models.fitting import EpochStats, FitSetup, FitState, episode_losses
+from headway.models.fitting import FitSetup, FitState, episode_losses
+from headway.models.updates import EpochStats
 from headway.planning.agent import Agent
 from headway.planning.last_layer.prior import fit_prior
 from headway.planning.last_layer.regression import Prior
