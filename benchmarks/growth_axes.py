@@ -1,7 +1,6 @@
 """What the growth curves vary, and the work that is timed at each point. Small networks."""
 
 import dataclasses
-import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +11,7 @@ from headway.config import FittingConfig, ModelConfig, PlannerConfig
 from headway.data import Episodes, Samples
 from headway.models.compilation import compiler_options, jit_networks
 from headway.models.dynamics import Statistics
-from headway.models.fitting import assign_segments, fit_epoch, make_data
+from headway.models.fitting import assign_segments, fit_epoch, make_data, one_epoch
 from headway.models.meeting import Program, in_groups, stack
 from headway.planning.search import act_in_one
 from headway.tasks.catalog import env_spec
@@ -72,7 +71,7 @@ def epoch_of_seeds(seeds: int) -> Work:
     """One epoch of every seed, likewise."""
     state, setup, data = make_fit(5, 5, MODEL, FITTING)
     named = {"independent": False, "key": jax.random.key(2)}
-    return _over_seeds(inspect.unwrap(fit_epoch), seeds, (state, setup, data), named)
+    return _over_seeds(one_epoch, seeds, (state, setup, data), named)
 
 
 def _over_seeds(function: Callable, seeds: int, *arguments: Any) -> Work:

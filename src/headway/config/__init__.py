@@ -5,7 +5,7 @@ released code. A setting is addressed as `section.name`, for example `planner.ho
 """
 
 from headway.config.fitting import FittingConfig
-from headway.config.model import PLAIN, ContextKind, ModelConfig
+from headway.config.model import PLAIN, ContextKind, ModelConfig, Precision
 from headway.config.planner import PlannerConfig
 from headway.config.protocol import CollectionConfig, EvaluationConfig
 from headway.config.run import Config
@@ -19,4 +19,5 @@ __all__ = [
     "FittingConfig",
     "ModelConfig",
     "PlannerConfig",
+    "Precision",
 ]

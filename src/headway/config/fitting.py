@@ -4,6 +4,7 @@ import dataclasses
 import typing
 from typing import Literal
 
+from headway.config.model import Precision
 from headway.problems import Problems
 
 Oracle = Literal["independent", "transition", "trajectory"]
@@ -27,6 +28,10 @@ class FittingConfig:
     block_transitions: int = 200_000
     """Most transitions, padding counted, that are fitted as one block; larger data are gone
     through block by block, in bounded memory. The paper's data are one block."""
+    precision: Precision = "float32"
+    """What the networks multiply while fitting, forwards and backwards; sums, weights and Adam are
+    always float32, and so are first layers (of the networks that predict) and the relation loss.
+    bfloat16 is faster where the processor multiplies it."""
     learning_rate: float = 1e-3
     """Adam's step size."""
     future_length: int = 5
@@ -80,5 +85,6 @@ class FittingConfig:
         problems.between(1e-6, 1e6, "relation_temperature")
         problems.at_least(0, "relation_distance_weight", "relation_transitions")
         problems.one_of("oracle", typing.get_args(Oracle))
+        problems.one_of("precision", typing.get_args(Precision))
         problems.one_of("reduction", ("head", "segment"))
         problems.report()

@@ -14,6 +14,7 @@ OWN_KINDS: set[str] = set()
 """Kinds that were registered (`headway.register_learner`)."""
 ContextKind = Literal["learned", "history", "sim-params"]
 ContextPlace = Literal["input", "last-hidden", "head"]
+Precision = Literal["float32", "bfloat16"]
 
 PLAIN: Mapping[str, Any] = {
     "num_members": 1,

@@ -4,6 +4,7 @@ import dataclasses
 import typing
 from typing import Literal
 
+from headway.config.model import Precision
 from headway.problems import Problems
 
 OptimizerName = Literal["cem", "icem", "mppi", "random-shooting"]
@@ -53,7 +54,7 @@ class PlannerConfig:
     particle_noise: Literal["independent", "shared"] = "independent"
     """Whether every candidate draws its own noise, or all share that of their particles: faster,
     and candidates are compared under equal luck."""
-    precision: Literal["float32", "bfloat16"] = "float32"
+    precision: Precision = "float32"
     """What the networks multiply while planning; sums and states are always float32."""
     devices: Literal["local", "all"] = "local"
     """Which devices share the candidates: those of this process, or of all processes that
@@ -117,7 +118,7 @@ class PlannerConfig:
         problems.one_of("selection_error", ("mean", "sampled", "corrected"))
         problems.one_of("reward", ("task", "released"))
         problems.one_of("particle_noise", ("independent", "shared"))
-        problems.one_of("precision", ("float32", "bfloat16"))
+        problems.one_of("precision", typing.get_args(Precision))
         problems.one_of("devices", ("local", "all"))
         problems.one_of("adaptation", typing.get_args(Adaptation))
         problems.one_of("adaptation_noise", ("constant", "heads"))

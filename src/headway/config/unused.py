@@ -124,6 +124,7 @@ _USED_WHEN: tuple[tuple[Callable[[Config], bool], tuple[str, ...]], ...] = (
             "fitting.logvar_bound_weight",
             "fitting.weight_decay",
             "fitting.adaptation_epochs",
+            "fitting.precision",
             "planner.head_selection",
             "planner.selection_error",
             "planner.selection_skips_newest",

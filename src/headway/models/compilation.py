@@ -2,12 +2,14 @@
 
 import functools
 import os
-from collections.abc import Callable
+import typing
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
 import platformdirs
 
+from headway.config import Precision
 from headway.models.meeting import Program, seat_here
 
 # Found by measuring on CPUs (docs/performance.md): full-width vectors make the activations
@@ -15,13 +17,16 @@ from headway.models.meeting import Program, seat_here
 # bfloat16 ones.
 _WIDE_VECTORS = {"xla_cpu_prefer_vector_width": 512}
 _NO_FUSIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
-_WANTED = {"float32": (_WIDE_VECTORS, _NO_FUSIONS), "bfloat16": (_WIDE_VECTORS,)}
+_WANTED: Mapping[Precision, tuple[dict[str, Any], ...]] = {
+    "float32": (_WIDE_VECTORS, _NO_FUSIONS),
+    "bfloat16": (_WIDE_VECTORS,),
+}
 _JAX_KEEPS, _KEPT = 1.0, 0.05
 """Seconds that a program must take to compile to be kept: JAX's default, and ours."""
 
 
 @functools.cache
-def compiler_options(precision: str = "float32") -> dict[str, Any]:
+def compiler_options(precision: Precision = "float32") -> dict[str, Any]:
     """The compiler options for products of a precision, without those this XLA does not know.
 
     Args:
@@ -39,7 +44,7 @@ def compiler_options(precision: str = "float32") -> dict[str, Any]:
     return options
 
 
-def jit_networks(function: Callable, *, precision: str = "float32") -> Callable:
+def jit_networks(function: Callable, *, precision: Precision = "float32") -> Callable:
     """`equinox.filter_jit` with the compiler options for many small products.
 
     The function is wrapped when first called, so that importing stays light. In a run that goes
@@ -55,6 +60,12 @@ def jit_networks(function: Callable, *, precision: str = "float32") -> Callable:
         return seat.compute(program, args, kwargs)
 
     return call
+
+
+def in_each_precision(function: Callable) -> dict[Precision, Callable]:
+    """A function that runs the networks, compiled for products of each precision."""
+    precisions: tuple[Precision, ...] = typing.get_args(Precision)
+    return {one: jit_networks(function, precision=one) for one in precisions}
 
 
 def keep_compilations() -> None:

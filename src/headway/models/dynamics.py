@@ -1,5 +1,6 @@
 """The multi-headed, context-conditional dynamics model (supplement A.3)."""
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from headway.config import ContextKind, ModelConfig
+from headway.config import ContextKind, ModelConfig, Precision
 from headway.data import (
     History,
     Trajectory,
@@ -17,7 +18,7 @@ from headway.data import (
     sim_params_row,
 )
 from headway.models.moments import Moments, merge_columns
-from headway.models.networks import Dense, DenseHeads, Normalizer, bound_logvar, swish
+from headway.models.networks import Dense, DenseHeads, Normalizer, bound_logvar, in_precision, swish
 from headway.tasks.base import Task
 
 PART_TRANSITIONS = 2**17  # read at once for statistics; the paper's whole data are one part
@@ -279,6 +280,23 @@ class MultiHeadDynamics(eqx.Module):
             relation_key = jax.random.fold_in(key, 3)
             relation = Dense.init(config.num_members, 2 * width, 1, key=relation_key)
         return cls(forward, backward, encoder, relation, config.context, sim_param_names)
+
+    def in_precision(self, precision: Precision) -> "MultiHeadDynamics":
+        """The model with products in a precision, apart from first layers and the relation head.
+
+        The first layers take observations, of which reduced precision would lose the digits.
+        """
+        if precision == "float32":
+            return self
+        change = functools.partial(in_precision, precision=precision)
+        return eqx.tree_at(MultiHeadDynamics._inner_layers, self, replace_fn=change)
+
+    def _inner_layers(self) -> list[Dense | DenseHeads]:
+        nets = [net for net in (self.forward_net, self.backward_net) if net is not None]
+        layers = [layer for net in nets for layer in (*net.hidden[1:], net.mean_heads)]
+        layers += [net.logvar_heads for net in nets if net.logvar_heads is not None]
+        encoder = self.context_encoder
+        return layers if encoder is None else [*layers, *encoder.hidden, encoder.output]
 
     @property
     def num_members(self) -> int:

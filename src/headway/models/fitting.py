@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from headway.config import FittingConfig
 from headway.data import Episodes, Samples, segment_sums
 from headway.models.batches import Batch
-from headway.models.compilation import jit_networks
+from headway.models.compilation import in_each_precision
 from headway.models.dynamics import GaussianNet, MultiHeadDynamics, Statistics, network_input
 from headway.models.losses import (
     assign_heads,
@@ -210,6 +210,7 @@ def episode_losses(
     batch = Batch(obs[:-1], action, obs[1:], past, jnp.ones(len(action)), physics)
     members = model.num_members
     batch = jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *x.shape)), batch)
+    model = model.in_precision(setup.config.precision)
     return head_losses(model, setup.task, statistics, batch)
 
 
@@ -253,7 +254,8 @@ def update(
     """Take one Adam step; a step with a non-finite loss or gradient is skipped."""
 
     def objective(model):
-        losses = head_losses(model, setup.task, data.statistics, batch)
+        reduced = model.in_precision(setup.config.precision)
+        losses = head_losses(reduced, setup.task, data.statistics, batch)
         loss, forward = total_loss(model, losses, owners, batch.weight, setup.config)
         if extra is not None:
             loss = loss + extra(model)
@@ -282,7 +284,6 @@ def of_update(
     return lambda model: extra(model, data, jax.random.fold_in(key, number))
 
 
-@jit_networks
 def fit_epoch(
     state: FitState,
     setup: FitSetup,
@@ -302,6 +303,20 @@ def fit_epoch(
         key: Shuffles the samples.
         extra: Another term of what is minimised, with a key of its own for every update.
     """
+    compiled = _COMPILED[setup.config.precision]
+    return compiled(state, setup, data, independent=independent, key=key, extra=extra)
+
+
+def one_epoch(
+    state: FitState,
+    setup: FitSetup,
+    data: FitData,
+    *,
+    independent: bool,
+    key: PRNGKeyArray,
+    extra: ExtraLoss | None = None,
+) -> tuple[FitState, EpochStats]:
+    """What `fit_epoch` compiles."""
     assignment = None
     if not independent:
         assignment = assign_segments(state.model, setup, data.episodes, data.statistics)
@@ -325,6 +340,9 @@ def fit_epoch(
     state, loss, forward, skipped = jax.lax.fori_loop(0, num_updates, step, carry)
     used = jnp.maximum(num_updates - skipped, 1)
     return state, EpochStats(loss / used, forward / used, skipped, num_updates)
+
+
+_COMPILED = in_each_precision(one_epoch)
 
 
 def shuffle(data: FitData, batch_size: int, key: PRNGKeyArray) -> Int[Array, "member sample"]:

@@ -4,11 +4,19 @@ A batched matrix product over members runs at the processor's full rate, so the 
 stays inside the layers; heads are folded into one product per network as well.
 """
 
+import dataclasses
+from typing import TypeVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
+
+from headway.config import Precision
+from headway.models.products import product
+
+Layer = TypeVar("Layer", "Dense", "DenseHeads")
 
 
 class Normalizer(eqx.Module):
@@ -53,6 +61,8 @@ class Dense(eqx.Module):
 
     weight: Float[Array, "member in out"]
     bias: Float[Array, "member out"]
+    precision: Precision = eqx.field(static=True, default="float32")
+    """What is multiplied."""
 
     @classmethod
     def init(cls, num_members: int, in_size: int, out_size: int, *, key: PRNGKeyArray) -> "Dense":
@@ -64,7 +74,7 @@ class Dense(eqx.Module):
 
     def __call__(self, x: Float[Array, "member batch in"]) -> Float[Array, "member batch out"]:
         """Apply each member's layer to its own inputs."""
-        return x @ self.weight + self.bias[:, None, :]
+        return product(x, self.weight, self.precision) + self.bias[:, None, :]
 
 
 class DenseHeads(eqx.Module):
@@ -72,6 +82,8 @@ class DenseHeads(eqx.Module):
 
     weight: Float[Array, "member head in out"]
     bias: Float[Array, "member head out"]
+    precision: Precision = eqx.field(static=True, default="float32")
+    """What is multiplied."""
 
     @classmethod
     def init(
@@ -87,8 +99,13 @@ class DenseHeads(eqx.Module):
         """Apply every head to its member's inputs, in one product."""
         members, heads, in_size, out_size = self.weight.shape
         stacked = self.weight.transpose(0, 2, 1, 3).reshape(members, in_size, heads * out_size)
-        out = (x @ stacked).reshape(members, -1, heads, out_size)
+        out = product(x, stacked, self.precision).reshape(members, -1, heads, out_size)
         return out.transpose(0, 2, 1, 3) + self.bias[:, :, None, :]
+
+
+def in_precision(layer: Layer, precision: Precision) -> Layer:
+    """The layer, with products in a precision."""
+    return dataclasses.replace(layer, precision=precision)
 
 
 def truncated_normal(key: PRNGKeyArray, shape: tuple[int, ...], fan_in: int) -> Array:

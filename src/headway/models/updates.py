@@ -44,8 +44,8 @@ def unless_broken(
         The new state or the old one, and whether the step was skipped.
     """
     size = sum((sum_of_squares(leaf) for leaf in jax.tree.leaves(gradients)), jnp.zeros(()))
-    broken = ~jnp.isfinite(size)
-    return jax.lax.cond(broken, lambda: state, step), broken
+    finite = jnp.isfinite(size)
+    return jax.lax.cond(finite, step, lambda: state), ~finite
 
 
 class Fitted(NamedTuple):

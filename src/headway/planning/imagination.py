@@ -11,14 +11,14 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, DTypeLike, Float, Int
+from jaxtyping import Array, Float, Int
 
 from headway.models.dynamics import GaussianNet, MultiHeadDynamics, Statistics
 from headway.models.networks import Dense, DenseHeads, swish
+from headway.models.products import PRECISIONS, rounded
 from headway.tasks.base import Task
 
 Correction = Float[Array, "env member head feature obs"]
-PRECISIONS = {"float32": jnp.float32, "bfloat16": jnp.bfloat16}
 
 
 class Layer(NamedTuple):
@@ -38,17 +38,6 @@ class Layer(NamedTuple):
             preferred_element_type=jnp.float32,
         )
         return product + self.bias[:, :, None, None]
-
-
-def rounded(x: Float[Array, "*shape"], dtype: DTypeLike) -> Float[Array, "*shape"]:
-    """`x` in a precision of `PRECISIONS`, to the nearest; of two equally near, the larger in size.
-
-    On CPUs XLA's own conversion to bfloat16 halves the vectors of whatever it is fused with.
-    """
-    if dtype != jnp.bfloat16 or jax.default_backend() != "cpu":
-        return x.astype(dtype)
-    bits = jax.lax.bitcast_convert_type(x, jnp.uint32) + jnp.uint32(2**15)
-    return jax.lax.bitcast_convert_type((bits >> 16).astype(jnp.uint16), jnp.bfloat16)
 
 
 def rough_swish(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:

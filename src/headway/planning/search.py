@@ -10,7 +10,7 @@ import jax
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from headway.models.compilation import jit_networks
+from headway.models.compilation import in_each_precision
 from headway.planning.acting import Decision
 from headway.planning.devices import brought_to_each, whole_on_each
 from headway.planning.optimizers import Optimizer, make_optimizer
@@ -139,11 +139,7 @@ _PARTS = {
     "tell": _tell,
     "end": _end,
 }
-_COMPILED = {
-    (name, precision): jit_networks(function, precision=precision)
-    for name, function in _PARTS.items()
-    for precision in ("float32", "bfloat16")
-}
+_COMPILED = {name: in_each_precision(function) for name, function in _PARTS.items()}
 
 
 def _traced(tree: Any) -> bool:
@@ -152,4 +148,4 @@ def _traced(tree: Any) -> bool:
 
 
 def _compiled(agent: Planning, name: str) -> Any:
-    return _COMPILED[name, agent.planner.precision]
+    return _COMPILED[name][agent.planner.precision]

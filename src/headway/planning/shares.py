@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from headway.config import PlannerConfig
 from headway.cpus import num_cpus
-from headway.models.compilation import jit_networks
+from headway.models.compilation import in_each_precision
 from headway.models.meeting import seat_here
 from headway.planning.returns import Dynamics, RolloutSettings, Share, candidate_returns
 from headway.tasks.base import Task
@@ -104,10 +104,7 @@ def _share_returns(
     return candidate_returns(dynamics, task, obs, mine, settings=settings, key=key, share=share)
 
 
-_COMPILED = {
-    precision: jit_networks(_share_returns, precision=precision)
-    for precision in ("float32", "bfloat16")
-}
+_COMPILED = in_each_precision(_share_returns)
 
 
 @functools.cache

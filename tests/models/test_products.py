@@ -1,0 +1,89 @@
+"""Products in reduced precision against float64, and fits that multiply so."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import toys
+from headway.config import FittingConfig, ModelConfig
+from headway.models.dynamics import MultiHeadDynamics, Statistics
+from headway.models.fitting import FitSetup, fit_epoch, make_data
+from headway.models.products import product, rounded
+
+TWO_LAYERS = ModelConfig(
+    num_members=2, num_heads=2, hidden_sizes=(8, 8), context_size=3, context_hidden_sizes=(5,)
+)
+
+
+def draws(seed, *shape):
+    return jax.random.normal(jax.random.key(seed), shape)
+
+
+def exact(values):
+    """What is left of values in bfloat16, in float64."""
+    return np.asarray(rounded(values, jnp.bfloat16).astype(jnp.float32), np.float64)
+
+
+def test_reduced_products_and_gradients_are_those_of_rounded_factors():
+    x, weight, gradient = draws(0, 2, 7, 5), draws(1, 2, 5, 4), draws(2, 2, 7, 4)
+    out, back = jax.vjp(lambda *factors: product(*factors, "bfloat16"), x, weight)
+    of_x, of_weight = back(gradient)
+    left, right, above = exact(x), exact(weight), exact(gradient)
+    np.testing.assert_allclose(out, left @ right, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(of_x, above @ right.swapaxes(1, 2), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(of_weight, left.swapaxes(1, 2) @ above, rtol=1e-5, atol=1e-6)
+    assert out.dtype == of_x.dtype == of_weight.dtype == jnp.float32
+
+
+def test_reduced_products_of_several_seeds_are_those_of_each():
+    x, weight = draws(0, 3, 2, 7, 5), draws(1, 3, 2, 5, 4)
+
+    def size(x, weight):
+        return jnp.square(product(x, weight, "bfloat16")).sum()
+
+    together = jax.vmap(jax.grad(size, argnums=(0, 1)))(x, weight)
+    alone = [jax.grad(size, argnums=(0, 1))(x[i], weight[i]) for i in range(3)]
+    for found, each in zip(together, zip(*alone, strict=True), strict=True):
+        np.testing.assert_allclose(found, jnp.stack(each), rtol=1e-5, atol=1e-5)
+
+
+def test_a_model_in_reduced_precision_keeps_its_weights_and_its_first_layers():
+    model = MultiHeadDynamics.init(TWO_LAYERS, toys.POINT, key=jax.random.key(0))
+    reduced = model.in_precision("bfloat16")
+    for net in (reduced.forward_net, reduced.backward_net):
+        assert [layer.precision for layer in net.hidden] == ["float32", "bfloat16"]
+        assert net.mean_heads.precision == "bfloat16"
+    assert {layer.precision for layer in reduced.context_encoder.hidden} == {"bfloat16"}
+    for a, b in zip(jax.tree.leaves(model), jax.tree.leaves(reduced), strict=True):
+        assert a is b
+    assert model.in_precision("float32") is model
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_a_fit_in_reduced_precision_learns_the_same(deterministic):
+    trajectories = [toys.random_trajectory(20, seed=seed) for seed in range(4)]
+    episodes, samples = toys.lay_out(trajectories, future_length=2)
+    config = dataclasses.replace(TWO_LAYERS, deterministic=deterministic)
+    model = MultiHeadDynamics.init(config, toys.POINT, key=jax.random.key(0))
+    losses = {}
+    for precision in ("float32", "bfloat16"):
+        fitting = FittingConfig(
+            precision=precision, future_length=2, segment_length=4, batch_size=16
+        )
+        setup = FitSetup(toys.POINT, fitting, TWO_LAYERS.history_length)
+        statistics = Statistics.fit(toys.POINT, trajectories, TWO_LAYERS.history_length)
+        key = jax.random.key(1)
+        data = make_data(episodes, samples, statistics, fitting, num_members=2, key=key)
+        state, losses[precision] = setup.init(model), []
+        for epoch in range(15):
+            key = jax.random.fold_in(key, epoch)
+            state, stats = fit_epoch(state, setup, data, independent=False, key=key)
+            losses[precision].append(float(stats.forward_loss))
+        assert jax.tree.structure(state.model) == jax.tree.structure(model)
+    full, reduced = losses["float32"], losses["bfloat16"]
+    assert full != reduced
+    assert full[-1] < full[0] - 0.2
+    np.testing.assert_allclose(reduced, full, atol=0.03 * (full[0] - full[-1]))
