@@ -205,7 +205,7 @@ def walk(seed, steps):
 
 
 AFTER_THE_MAIN_THREAD = """
-import threading, time
+import threading
 from headway.planning import shares
 from planning.test_shares import walk
 shares.LEAST, shares.num_cpus = 1, lambda: 3

@@ -62,7 +62,7 @@ def iterate(
     kind, key = optimizer.kind(iteration), begun.keys[iteration]
     shares = num_shares(planner, len(begun.obs))
     if shares == 1:
-        return _compiled(agent, "iterate")(agent, begun.prepared, begun.obs, search, key, kind)
+        return _compiled(agent, "iterate")(agent, begun, search, key, kind)
     candidates, score_key = _compiled(agent, "ask")(optimizer, search, key, kind)
     question = Question(begun.prepared.dynamics, agent.task, begun.obs, candidates, score_key)
     returns = returns_of_shares(question, planner, shares)
@@ -71,7 +71,7 @@ def iterate(
 
 def end(agent: Planning, state: Any, begun: Begun, search: Any) -> tuple[Any, Decision]:
     """The decision, by the search as it is now."""
-    return _compiled(agent, "end")(agent, state, begun.obs, begun.prepared, search)
+    return _compiled(agent, "end")(agent, state, begun, search)
 
 
 def act_in_one(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[Any, Decision]:
@@ -93,15 +93,10 @@ def _begin(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[B
 
 
 def _iterate(
-    agent: Planning,
-    prepared: Any,
-    obs: Float[Array, "env obs"],
-    search: Any,
-    key: PRNGKeyArray,
-    iteration: int,
+    agent: Planning, begun: Begun, search: Any, key: PRNGKeyArray, iteration: int
 ) -> tuple[Any, Bool[Array, " env"]]:
     optimizer = make_optimizer(agent.planner)
-    score = scoring(agent.task, agent.planner, prepared.dynamics, obs)
+    score = scoring(agent.task, agent.planner, begun.prepared.dynamics, begun.obs)
     search = optimizer.iterate(score, search, key, iteration)
     return whole_on_each((search, optimizer.settled(search)), agent.planner.devices)
 
@@ -124,11 +119,10 @@ def _tell(
     return search, optimizer.settled(search)
 
 
-def _end(
-    agent: Planning, state: Any, obs: Float[Array, "env obs"], prepared: Any, search: Any
-) -> tuple[Any, Decision]:
+def _end(agent: Planning, state: Any, begun: Begun, search: Any) -> tuple[Any, Decision]:
     plan = make_optimizer(agent.planner).end(search)
-    return whole_on_each(agent.decide(state, obs, prepared, plan), agent.planner.devices)
+    decided = agent.decide(state, begun.obs, begun.prepared, plan)
+    return whole_on_each(decided, agent.planner.devices)
 
 
 _PARTS = {
