@@ -1,10 +1,11 @@
 """The tools of the benchmarks: what they compute from what was measured."""
 
 import json
+from pathlib import Path
 
 import pytest
 from growth import exponent
-from hlo_parts import ACTIVATION, NOISE, PRODUCTS, SAMPLING, SEARCH, TASK, Module
+from hlo_parts import ACTIVATION, NOISE, PRODUCTS, RULES, SAMPLING, SEARCH, TASK, Module
 from machine import machine_kind
 from op_trace import Operation, Span, exclusive_seconds
 from profile_plan import OVERHEAD, profile
@@ -13,6 +14,7 @@ from save import save
 from targets import Target
 from workloads import make_agent
 
+import headway
 from headway.config import ModelConfig, PlannerConfig
 
 PLAN = Target("plan", "cpu", "a plan", 0.8, "ratio", "")
@@ -102,6 +104,14 @@ def small_plan():
     )
     agent, state, obs = make_agent(1, model, planner)
     return lambda: agent.act(state, obs)
+
+
+def test_the_profile_looks_for_functions_that_there_are():
+    source = Path(headway.__file__).parent
+    for path, function, _ in RULES:
+        files = [file for file in source.rglob("*.py") if path in str(file)]
+        name = function.rsplit(".", 1)[-1]
+        assert any(name in file.read_text() for file in files), (path, function)
 
 
 def test_profile_finds_the_parts_of_a_plan(small_plan):

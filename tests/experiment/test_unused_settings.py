@@ -119,6 +119,8 @@ def test_what_a_method_can_use_separates_runs():
     assert not separates("tmcl", "planner.forgetting")
     assert separates("rebal", "fitting.backprop_steps")
     assert not separates("grbal", "fitting.backprop_steps")
+    assert separates("pets", "fitting.precision")
+    assert not separates("grbal", "fitting.precision")
     assert separates("true-dynamics", "planner.num_candidates")
     assert not separates("random", "planner.num_candidates")
 

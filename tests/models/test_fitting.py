@@ -215,8 +215,9 @@ def test_only_the_update_with_non_finite_loss_is_skipped_and_counted():
     ).any()
 
 
-def test_an_epoch_of_nothing_but_non_finite_updates_leaves_everything_as_it_was():
-    state, setup, data = small_fit(switches=PLAIN)
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_an_epoch_of_nothing_but_non_finite_updates_leaves_everything_as_it_was(precision):
+    state, setup, data = small_fit(switches=PLAIN, precision=precision)
     huge = dataclasses.replace(data.episodes, obs=1e25 * (1 + data.episodes.obs))
     data = data._replace(episodes=huge, statistics=toys.identity_statistics())
     fitted, stats = fit_epoch(state, setup, data, independent=True, key=jax.random.key(0))

@@ -202,9 +202,10 @@ def test_memory_is_shared_by_the_seeds(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_fit_and_a_plan_of_several_seeds_equal_those_of_each():
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_a_fit_and_a_plan_of_several_seeds_equal_those_of_each(precision):
     """The data differ in length, so some seeds make more updates than others."""
-    fitting = FittingConfig(batch_size=8, future_length=2, segment_length=3)
+    fitting = FittingConfig(batch_size=8, future_length=2, segment_length=3, precision=precision)
     setup = FitSetup(POINT, fitting, SMALL.history_length)
     planner = PlannerConfig(
         horizon=3, num_candidates=8, num_elites=3, num_iterations=3, num_particles=2,

@@ -9,13 +9,23 @@ import pytest
 
 import toys
 from headway.config import FittingConfig, ModelConfig
+from headway.errors import ConfigError
+from headway.experiment.methods import make_config
+from headway.models import compilation, fitting
+from headway.models.compilation import in_each_precision
 from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.models.fitting import FitSetup, fit_epoch, make_data
+from headway.models.fitting import FitSetup, episode_losses, fit_epoch, make_data
 from headway.models.products import product, rounded
 
 TWO_LAYERS = ModelConfig(
     num_members=2, num_heads=2, hidden_sizes=(8, 8), context_size=3, context_hidden_sizes=(5,)
 )
+
+BOTH = ("float32", "bfloat16")
+
+
+def recording(called, name, function):
+    return lambda *args, **named: called.append(name) or function(*args, **named)
 
 
 def draws(seed, *shape):
@@ -62,21 +72,53 @@ def test_a_model_in_reduced_precision_keeps_its_weights_and_its_first_layers():
     assert model.in_precision("float32") is model
 
 
+def test_heads_are_assigned_by_the_model_that_is_fitted():
+    trajectories = [toys.random_trajectory(9, seed=seed) for seed in range(2)]
+    episodes, _ = toys.lay_out(trajectories, future_length=2)
+    model = MultiHeadDynamics.init(TWO_LAYERS, toys.POINT, key=jax.random.key(0))
+
+    def losses(model, precision):
+        setup = FitSetup(toys.POINT, FittingConfig(precision=precision), TWO_LAYERS.history_length)
+        statistics = Statistics.fit(toys.POINT, trajectories, TWO_LAYERS.history_length)
+        return episode_losses(model, setup, episodes, 0, statistics).forward
+
+    reduced = losses(model, "bfloat16")
+    np.testing.assert_array_equal(reduced, losses(model.in_precision("bfloat16"), "float32"))
+    assert (reduced != losses(model, "float32")).any()
+
+
+def test_each_precision_is_compiled_with_its_own_options(monkeypatch):
+    asked = []
+    monkeypatch.setattr(compilation, "compiler_options", lambda one: asked.append(one) or {})
+    compiled = in_each_precision(lambda x: x + 1)
+    for precision in ("bfloat16", "float32"):
+        compiled[precision](jnp.zeros(2))
+    assert asked == ["bfloat16", "float32"]
+
+
+def test_a_relation_head_is_fitted_in_float32_alone():
+    with pytest.raises(ConfigError, match="precision is 'bfloat16', allowed: float32"):
+        make_config("pendulum", method="ria", settings={"fitting.precision": "bfloat16"})
+
+
 @pytest.mark.parametrize("deterministic", [False, True])
-def test_a_fit_in_reduced_precision_learns_the_same(deterministic):
+def test_a_fit_in_reduced_precision_learns_the_same(deterministic, monkeypatch):
+    called = []
+    compiled = {name: recording(called, name, fitting._COMPILED[name]) for name in BOTH}
+    monkeypatch.setattr(fitting, "_COMPILED", compiled)
     trajectories = [toys.random_trajectory(20, seed=seed) for seed in range(4)]
     episodes, samples = toys.lay_out(trajectories, future_length=2)
     config = dataclasses.replace(TWO_LAYERS, deterministic=deterministic)
     model = MultiHeadDynamics.init(config, toys.POINT, key=jax.random.key(0))
     losses = {}
-    for precision in ("float32", "bfloat16"):
-        fitting = FittingConfig(
+    for precision in BOTH:
+        settings = FittingConfig(
             precision=precision, future_length=2, segment_length=4, batch_size=16
         )
-        setup = FitSetup(toys.POINT, fitting, TWO_LAYERS.history_length)
+        setup = FitSetup(toys.POINT, settings, TWO_LAYERS.history_length)
         statistics = Statistics.fit(toys.POINT, trajectories, TWO_LAYERS.history_length)
         key = jax.random.key(1)
-        data = make_data(episodes, samples, statistics, fitting, num_members=2, key=key)
+        data = make_data(episodes, samples, statistics, settings, num_members=2, key=key)
         state, losses[precision] = setup.init(model), []
         for epoch in range(15):
             key = jax.random.fold_in(key, epoch)
@@ -85,5 +127,6 @@ def test_a_fit_in_reduced_precision_learns_the_same(deterministic):
         assert jax.tree.structure(state.model) == jax.tree.structure(model)
     full, reduced = losses["float32"], losses["bfloat16"]
     assert full != reduced
+    assert called == 15 * ["float32"] + 15 * ["bfloat16"]
     assert full[-1] < full[0] - 0.2
     np.testing.assert_allclose(reduced, full, atol=0.03 * (full[0] - full[-1]))

@@ -190,6 +190,21 @@ def test_the_relation_loss_has_an_adam_of_its_own_and_starts_from_the_same_weigh
     assert moved.context_encoder.output.weight.min() < 1e-3
 
 
+def test_nothing_is_learned_where_only_the_relation_loss_is_not_finite():
+    setup = FitSetup(toys.POINT, FittingConfig(batch_size=8), 3)
+    data = fit_data(setup, [toys.random_trajectory(6, seed=n) for n in range(3)])
+    model = MultiHeadDynamics.init(RIA, toys.POINT, key=jax.random.key(0))
+    huge = jnp.full_like(model.relation_head.weight, 3e38)
+    state = setup.init(eqx.tree_at(lambda model: model.relation_head.weight, model, huge))
+    order = jnp.broadcast_to(jnp.arange(8), (2, 8))
+    batch, _ = gather_batch(data, None, order, jnp.ones((2, 8)), setup)
+    after, (loss, _, skipped) = eqx.filter_jit(update)(state, setup, data, batch, None)
+    assert bool(skipped)
+    assert float(loss) == 0.0
+    for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(state), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 def test_the_relation_is_learned_and_contexts_of_one_trajectory_come_together():
     trajectories = [toys.random_trajectory(12, seed=n, gain=g) for n, g in enumerate((1, -1) * 3)]
     config = FittingConfig(batch_size=32, learning_rate=3e-3, relation_distance_weight=20.0)

@@ -29,9 +29,9 @@ class FittingConfig:
     """Most transitions, padding counted, that are fitted as one block; larger data are gone
     through block by block, in bounded memory. The paper's data are one block."""
     precision: Precision = "float32"
-    """What the networks multiply while fitting, forwards and backwards; sums, weights and Adam are
-    always float32, and so are first layers (of the networks that predict) and the relation loss.
-    bfloat16 is faster where the processor multiplies it."""
+    """What the networks multiply while fitting, forwards and backwards. Sums, weights and Adam are
+    always float32, and so are the first layers of the networks that predict, and the loss of
+    adaptation epochs. bfloat16 is faster where the processor multiplies it; RIA cannot use it."""
     learning_rate: float = 1e-3
     """Adam's step size."""
     future_length: int = 5

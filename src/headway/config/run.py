@@ -48,6 +48,11 @@ class Config:
             f" model.num_members ({self.model.num_members})",
         )
         problems.require(
+            not self.model.relation_head or self.fitting.precision == "float32",
+            f"fitting.precision is {shown(self.fitting.precision)}, allowed: float32 with a"
+            " relation head, whose losses are most of a fit and always float32",
+        )
+        problems.require(
             self.model.kind != "simulator" or self.planner.num_particles == 1,
             f"planner.num_particles is {self.planner.num_particles}, allowed: 1, because the"
             " simulator has no noise",

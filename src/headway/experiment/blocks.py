@@ -26,7 +26,6 @@ from headway.data import Episodes, Samples, Trajectory
 from headway.experiment.methods import told_sim_params
 from headway.models.dynamics import Statistics
 from headway.models.fitting import (
-    EpochStats,
     ExtraLoss,
     FitData,
     FitSetup,
@@ -34,6 +33,7 @@ from headway.models.fitting import (
     fit_epoch,
     make_data,
 )
+from headway.models.updates import EpochStats
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")

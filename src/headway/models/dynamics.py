@@ -282,9 +282,10 @@ class MultiHeadDynamics(eqx.Module):
         return cls(forward, backward, encoder, relation, config.context, sim_param_names)
 
     def in_precision(self, precision: Precision) -> "MultiHeadDynamics":
-        """The model with products in a precision, apart from first layers and the relation head.
+        """The model with products in a precision, but for the relation head and some first layers.
 
-        The first layers take observations, of which reduced precision would lose the digits.
+        Those of the networks that predict take observations, whose digits reduced precision would
+        lose; the context encoder takes differences of them.
         """
         if precision == "float32":
             return self

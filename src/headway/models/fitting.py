@@ -265,13 +265,15 @@ def update(
         return loss + pull, (forward, similar)
 
     (loss, (forward, similar)), grads = jax.value_and_grad(objective, has_aux=True)(state.model)
-    relation = None, None
+    relation_loss, relation_grads = jnp.zeros(()), None
     if similar is not None:
         # Both gradients are taken at the same weights, each with an Adam of its own.
         decay = setup.config.weight_decay
-        relation = relation_gradient(state.model, data.statistics, batch, similar, decay)
-    taken = functools.partial(setup.step, state, grads, relation[1])
-    state, skipped = unless_broken(taken, state, ((loss, grads), relation))
+        relation_loss, relation_grads = relation_gradient(
+            state.model, data.statistics, batch, similar, decay
+        )
+    taken = functools.partial(setup.step, state, grads, relation_grads)
+    state, skipped = unless_broken(taken, state, loss + relation_loss, (grads, relation_grads))
     return state, (jnp.where(skipped, 0.0, loss), jnp.where(skipped, 0.0, forward), skipped)
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from headway.config import Precision
 from headway.models.products import product
 
-Layer = TypeVar("Layer", "Dense", "DenseHeads")
+AnyDense = TypeVar("AnyDense", "Dense", "DenseHeads")
 
 
 class Normalizer(eqx.Module):
@@ -103,7 +103,7 @@ class DenseHeads(eqx.Module):
         return out.transpose(0, 2, 1, 3) + self.bias[:, :, None, :]
 
 
-def in_precision(layer: Layer, precision: Precision) -> Layer:
+def in_precision(layer: AnyDense, precision: Precision) -> AnyDense:
     """The layer, with products in a precision."""
     return dataclasses.replace(layer, precision=precision)
 

@@ -26,9 +26,11 @@ def product(
 
 
 def rounded(x: Float[Array, "*shape"], dtype: DTypeLike) -> Float[Array, "*shape"]:
-    """`x` in a precision of `PRECISIONS`, to the nearest; of two equally near, the larger in size.
+    """`x` in a precision of `PRECISIONS`, to the nearest.
 
-    On CPUs XLA's own conversion to bfloat16 halves the vectors of whatever it is fused with.
+    On CPUs XLA's own conversion to bfloat16 halves the vectors of whatever it is fused with. Ours
+    takes of two equally near the larger in size, XLA's the even one. A NaN stays one, but for those
+    whose bits are nearly all set, which no operation of ours makes.
     """
     if dtype != jnp.bfloat16 or jax.default_backend() != "cpu":
         return x.astype(dtype)

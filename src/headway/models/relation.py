@@ -23,7 +23,7 @@ from headway.models.dynamics import (
     flat_history,
     network_input,
 )
-from headway.models.losses import HIDDEN_DECAY, weight_decay_loss
+from headway.models.losses import HIDDEN_DECAY, sum_of_squares, weight_decay_loss
 from headway.models.networks import Dense, swish
 from headway.tasks.base import Task
 
@@ -143,7 +143,7 @@ def relation_loss(
 def relation_decay_loss(parts: RelationParts) -> Float[Array, ""]:
     """Weight decay of the encoder, averaged over its layers, and of the relation head."""
     num_layers = len(parts.encoder.hidden) + 1
-    head = 0.5 * HIDDEN_DECAY[0] * jnp.square(parts.head.weight).sum()
+    head = 0.5 * HIDDEN_DECAY[0] * sum_of_squares(parts.head.weight)
     return weight_decay_loss(parts.encoder) / num_layers + head
 
 

@@ -1,5 +1,6 @@
 """Steps of an optimiser, none of which is taken with a number that is not finite."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
@@ -28,24 +29,28 @@ class EpochStats(NamedTuple):
 
 
 def unless_broken(
-    step: Callable[[], State], state: State, gradients: Any
+    step: Callable[[], State], state: State, loss: Float[Array, ""], grads: Any
 ) -> tuple[State, Bool[Array, ""]]:
-    """Take a step, unless a loss or a gradient is not finite.
+    """Take a step, unless the loss, or the norm of the gradient, is not a finite float32.
 
-    A branch, since a choice between old and new numbers costs as much as the step itself: both are
-    read and written again.
+    On a CPU it is a branch: choosing between old and new numbers costs as much as the step itself,
+    for both are read and written again. Where seeds are trained together XLA makes a choice of it.
 
     Args:
-        step: The new state.
+        step: Gives the new state.
         state: The old one.
-        gradients: Losses and gradients, any tree of arrays.
+        loss: What is minimised.
+        grads: Its gradient, any tree of arrays.
 
     Returns:
         The new state or the old one, and whether the step was skipped.
     """
-    size = sum((sum_of_squares(leaf) for leaf in jax.tree.leaves(gradients)), jnp.zeros(()))
-    finite = jnp.isfinite(size)
-    return jax.lax.cond(finite, step, lambda: state), ~finite
+    size = sum((sum_of_squares(leaf) for leaf in jax.tree.leaves(grads)), jnp.zeros(()))
+    finite = jnp.isfinite(loss) & jnp.isfinite(size)
+    if jax.default_backend() == "cpu":
+        # In this order: with the branches exchanged XLA copies weights and moments.
+        return jax.lax.cond(finite, step, lambda: state), ~finite
+    return jax.tree.map(functools.partial(jnp.where, finite), step(), state), ~finite
 
 
 class Fitted(NamedTuple):
@@ -72,7 +77,7 @@ class Fitted(NamedTuple):
             changes, optimizer = optax.adam(learning_rate).update(grads, self.optimizer)
             return Fitted(eqx.apply_updates(self.model, changes), optimizer)
 
-        return unless_broken(taken, self, (loss, grads))
+        return unless_broken(taken, self, loss, grads)
 
 
 class Tally(NamedTuple):

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from headway.models.products import PRECISIONS
 from headway.planning.heads import RecentTransitions
-from headway.planning.imagination import PRECISIONS, Doubt, Layer
+from headway.planning.imagination import Doubt, Layer
 from headway.planning.last_layer.regression import (
     LastLayer,
     Observed,
