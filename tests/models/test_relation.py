@@ -174,12 +174,18 @@ def fit_data(setup, trajectories):
     )
 
 
-def test_the_relation_loss_has_an_adam_of_its_own_and_starts_from_the_same_weights():
+def first_update():
+    """A new model, and what its first update reads."""
     setup = FitSetup(toys.POINT, FittingConfig(batch_size=8), 3)
     data = fit_data(setup, [toys.random_trajectory(6, seed=n) for n in range(3)])
     model = MultiHeadDynamics.init(RIA, toys.POINT, key=jax.random.key(0))
     order = jnp.broadcast_to(jnp.arange(8), (2, 8))
     batch, _ = gather_batch(data, None, order, jnp.ones((2, 8)), setup)
+    return model, setup, data, batch
+
+
+def test_the_relation_loss_has_an_adam_of_its_own_and_starts_from_the_same_weights():
+    model, setup, data, batch = first_update()
     state = setup.init(model)
     both, _ = eqx.filter_jit(update)(state, setup, data, batch, None)
     # Adam's first step has the size of the learning rate in every weight that has a gradient.
@@ -191,13 +197,9 @@ def test_the_relation_loss_has_an_adam_of_its_own_and_starts_from_the_same_weigh
 
 
 def test_nothing_is_learned_where_only_the_relation_loss_is_not_finite():
-    setup = FitSetup(toys.POINT, FittingConfig(batch_size=8), 3)
-    data = fit_data(setup, [toys.random_trajectory(6, seed=n) for n in range(3)])
-    model = MultiHeadDynamics.init(RIA, toys.POINT, key=jax.random.key(0))
+    model, setup, data, batch = first_update()
     huge = jnp.full_like(model.relation_head.weight, 3e38)
     state = setup.init(eqx.tree_at(lambda model: model.relation_head.weight, model, huge))
-    order = jnp.broadcast_to(jnp.arange(8), (2, 8))
-    batch, _ = gather_batch(data, None, order, jnp.ones((2, 8)), setup)
     after, (loss, _, skipped) = eqx.filter_jit(update)(state, setup, data, batch, None)
     assert bool(skipped)
     assert float(loss) == 0.0

@@ -286,7 +286,7 @@ def of_update(
     return lambda model: extra(model, data, jax.random.fold_in(key, number))
 
 
-def fit_epoch(
+def one_epoch(
     state: FitState,
     setup: FitSetup,
     data: FitData,
@@ -305,20 +305,6 @@ def fit_epoch(
         key: Shuffles the samples.
         extra: Another term of what is minimised, with a key of its own for every update.
     """
-    compiled = _COMPILED[setup.config.precision]
-    return compiled(state, setup, data, independent=independent, key=key, extra=extra)
-
-
-def one_epoch(
-    state: FitState,
-    setup: FitSetup,
-    data: FitData,
-    *,
-    independent: bool,
-    key: PRNGKeyArray,
-    extra: ExtraLoss | None = None,
-) -> tuple[FitState, EpochStats]:
-    """What `fit_epoch` compiles."""
     assignment = None
     if not independent:
         assignment = assign_segments(state.model, setup, data.episodes, data.statistics)
@@ -345,6 +331,12 @@ def one_epoch(
 
 
 _COMPILED = in_each_precision(one_epoch)
+
+
+@functools.wraps(one_epoch)
+def fit_epoch(state: FitState, setup: FitSetup, *args: Any, **named: Any) -> Any:
+    """`one_epoch`, compiled for the precision of the fit."""
+    return _COMPILED[setup.config.precision](state, setup, *args, **named)
 
 
 def shuffle(data: FitData, batch_size: int, key: PRNGKeyArray) -> Int[Array, "member sample"]:

@@ -19,7 +19,7 @@ PRECISIONS = {"float32": jnp.float32, "bfloat16": jnp.bfloat16}
 def product(
     x: Float[Array, "member batch in"],
     weight: Float[Array, "member in out"],
-    precision: Precision = "float32",
+    precision: Precision,
 ) -> Float[Array, "member batch out"]:
     """Each member's product; its gradient multiplies in the same precision."""
     return x @ weight if precision == "float32" else _reduced(x, weight)
