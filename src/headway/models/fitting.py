@@ -28,6 +28,7 @@ from headway.models.losses import (
     oracle_loss,
 )
 from headway.models.relation import add_parts, intervene, relation_gradient, relation_parts
+from headway.models.shuffling import permutations
 from headway.models.updates import EpochStats, unless_broken
 from headway.tasks.base import Task
 
@@ -344,10 +345,8 @@ def shuffle(data: FitData, batch_size: int, key: PRNGKeyArray) -> Int[Array, "me
 
     The result is padded to a whole number of batches.
     """
-    members, capacity = data.rows.shape
-    draws = jax.random.uniform(key, (members, capacity))
-    order = jnp.argsort(jnp.where(jnp.arange(capacity) < data.samples.count, draws, jnp.inf))
-    return jnp.pad(order, ((0, 0), (0, -capacity % batch_size)))
+    order = permutations(key, data.rows.shape, data.samples.count)
+    return jnp.pad(order, ((0, 0), (0, -order.shape[1] % batch_size)))
 
 
 def make_data(
