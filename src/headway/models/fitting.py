@@ -345,8 +345,9 @@ def shuffle(data: FitData, batch_size: int, key: PRNGKeyArray) -> Int[Array, "me
 
     The result is padded to a whole number of batches.
     """
-    order = permutations(key, data.rows.shape, data.samples.count)
-    return jnp.pad(order, ((0, 0), (0, -order.shape[1] % batch_size)))
+    members, capacity = data.rows.shape
+    order = permutations(key, (members, capacity), data.samples.count)
+    return jnp.pad(order, ((0, 0), (0, -capacity % batch_size)))
 
 
 def make_data(
