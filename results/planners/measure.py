@@ -53,7 +53,7 @@ def planners(own: PlannerConfig, num_members: int) -> dict[str, Settings]:
     return {
         "cem": {},
         "paper": paper,
-        "fast": fast,
+        "fast": fast,  # the preset's with CEM; some environments want "fast, icem, beta 0.25"
         "fast, 4 iterations": fast | {"num_iterations": 4},
         "fast, 133 candidates": fast | {"num_candidates": 133, "num_elites": 27},
         "fast, shared noise": fast | {"particle_noise": "shared"},

@@ -40,9 +40,12 @@ def test_paper_preset_has_the_supplements_numbers():
 
 
 @pytest.mark.parametrize("method", ["tmcl", "pets"])
-def test_fast_preset_plans_with_a_tenth_of_the_papers_arithmetic_and_changes_nothing_else(method):
-    paper, fast = (make_config("hopper", method=method, preset=name) for name in ("paper", "fast"))
-    task = env_spec("hopper").make_task()
+@pytest.mark.parametrize("env", ["hopper", "pendulum"])
+def test_fast_preset_plans_with_a_tenth_of_the_papers_arithmetic_and_changes_nothing_else(
+    method, env
+):
+    paper, fast = (make_config(env, method=method, preset=name) for name in ("paper", "fast"))
+    task = env_spec(env).make_task()
     costs = [plan_flop(config.model, config.planner, task) for config in (paper, fast)]
     assert 10 * costs[1] <= costs[0]
     assert dataclasses.replace(fast, preset="paper", planner=paper.planner) == paper

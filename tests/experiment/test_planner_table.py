@@ -31,10 +31,13 @@ def test_every_planner_of_the_comparison_is_another_valid_one(scripts, method, p
     assert {planner.optimizer for planner in found} == {"cem", "icem", "mppi", "random-shooting"}
 
 
-def test_the_planner_called_fast_is_that_of_the_preset(scripts):
+@pytest.mark.parametrize(
+    ("env", "name"), [("hopper", "fast"), ("pendulum", "fast, icem, beta 0.25")]
+)
+def test_the_preset_fast_is_among_the_planners_compared(scripts, env, name):
     measure, _ = scripts
-    paper, fast = (make_config("hopper", preset=preset) for preset in ("paper", "fast"))
-    settings = measure.distinct(paper)["fast"]
+    paper, fast = (make_config(env, preset=preset) for preset in ("paper", "fast"))
+    settings = measure.distinct(paper)[name]
     assert config_to_evaluate(paper, settings).planner == fast.planner
 
 

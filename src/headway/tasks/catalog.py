@@ -38,6 +38,9 @@ class EnvSpec:
     """One line for lists."""
     epochs: int = 50
     """Passes over the data per iteration at the paper's scale (supplement A.2)."""
+    noise_beta: float | None = None
+    """Exponent of the power spectrum of the noise with which iCEM searches in the preset `fast`;
+    None searches with CEM, whose noise is white."""
 
 
 _SPECS: dict[str, EnvSpec] = {}
@@ -134,6 +137,7 @@ _BUILT_IN = (
         default_sim_params={"length": 1.0, "mass": 1.0},
         description="swing a pendulum of unknown length up",
         epochs=5,
+        noise_beta=0.25,
     ),
     EnvSpec(
         name="cartpole-swingup",
@@ -147,6 +151,7 @@ _BUILT_IN = (
         default_sim_params={"mass_scale": 1.0},
         options={"terminate_off_track": False},
         description="swing a pole of unknown mass up by its cart, also of unknown mass",
+        noise_beta=0.25,
     ),
     EnvSpec(
         name="hopper",
