@@ -33,7 +33,7 @@ def twin_history(trajectory, step, length):
     return obs_diff, action
 
 
-@pytest.mark.parametrize("length", [1, 3, 10])
+@pytest.mark.parametrize("length", [1, 3, 10, 20])  # 20 are more than an episode has
 def test_history_at_every_step_of_ragged_episodes_equals_its_numpy_twin(length):
     trajectories = [toys.random_trajectory(n, seed=n) for n in RAGGED]
     episodes = Episodes.pad(trajectories, capacity=5, max_length=14)

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -91,6 +92,28 @@ def history_slots(step: Any, length: int, xp: Any) -> tuple[Any, Any]:
     return index, index < step
 
 
+def windows(
+    values: Float[Array, "episode time size"],
+    episode: Int[Array, "*batch"],
+    start: Int[Array, "*batch"],
+    length: int,
+) -> Float[Array, "*batch length size"]:
+    """Gather consecutive rows of episodes, as one piece of memory each.
+
+    Args:
+        values: One row per step.
+        episode: The episode of each window.
+        start: Its first step.
+        length: Rows of a window.
+    """
+    size = values.shape[-1]
+
+    def window(episode: Int[Array, ""], start: Int[Array, ""]) -> Float[Array, "length size"]:
+        return jax.lax.dynamic_slice(values, (episode, start, 0), (1, length, size))[0]
+
+    return jnp.vectorize(window, signature="(),()->(k,n)")(episode, start)
+
+
 class Episodes(eqx.Module):
     """All trajectories as padded arrays on the device; rows past `count` are empty."""
 
@@ -139,13 +162,15 @@ class Episodes(eqx.Module):
             length: Number of slots (K).
         """
         index, used = history_slots(step[..., None], length, jnp)
-        index = jnp.minimum(index, self.action.shape[1] - 1)
-        rows = episode[..., None]
-        obs_diff = self.obs[rows, index + 1] - self.obs[rows, index]
-        return History(
-            obs_diff=jnp.where(used[..., None], obs_diff, 0.0),
-            action=jnp.where(used[..., None], self.action[rows, index], 0.0),
-        )
+        there = min(length, self.action.shape[1])  # slots past a short episode are never used
+        obs = windows(self.obs, episode, index[..., 0], there + 1)
+        action = windows(self.action, episode, index[..., 0], there)
+
+        def filled(values: Float[Array, "*batch slot size"]) -> Float[Array, "*batch K size"]:
+            missing = [(0, 0)] * step.ndim + [(0, length - there), (0, 0)]
+            return jnp.where(used[..., None], jnp.pad(values, missing), 0.0)
+
+        return History(filled(jnp.diff(obs, axis=-2)), filled(action))
 
 
 class Samples(NamedTuple):

@@ -8,7 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from headway.models.moments import Moments
-from headway.models.networks import Dense, DenseHeads, Normalizer, swish, truncated_normal
+from headway.models.networks import (
+    Dense,
+    DenseHeads,
+    Normalizer,
+    columns_of_each,
+    softplus,
+    swish,
+    truncated_normal,
+)
 
 
 def fit(values):
@@ -71,6 +79,27 @@ def test_dense_layers_equal_their_numpy_twins_per_member_and_head():
             twin = x[member] @ weight[member, head] + bias[member, head]
             np.testing.assert_allclose(got[member, head], twin, rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(single[member], got[member, 1], rtol=1e-5, atol=1e-6)
+
+
+def test_layers_of_heads_in_one_product_are_those_of_each():
+    draw = np.random.default_rng(1).normal
+    x = jnp.asarray(draw(size=(2, 4, 5)), jnp.float32)
+    layers = [
+        DenseHeads(
+            jnp.asarray(draw(size=(2, 3, 4, 6)), jnp.float32),
+            jnp.asarray(draw(size=(2, 3, 6)), jnp.float32),
+        )
+        for _ in range(2)
+    ]
+    for layer, found in zip(layers, columns_of_each(layers, x), strict=True):
+        np.testing.assert_allclose(found, layer(x.mT).mT, rtol=1e-5, atol=1e-6)
+
+
+def test_softplus_and_its_slope_are_jaxs():
+    x = jnp.asarray([-200.0, -20.0, -3.0, -0.1, 0.0, 0.1, 3.0, 20.0, 200.0])
+    np.testing.assert_allclose(softplus(x), jax.nn.softplus(x), rtol=1e-6, atol=1e-7)
+    slope, twin = (jax.vmap(jax.grad(one))(x) for one in (softplus, jax.nn.softplus))
+    np.testing.assert_allclose(slope, twin, rtol=1e-5, atol=1e-7)
 
 
 def test_initial_weights_are_truncated_at_two_deviations_and_biases_zero():

@@ -15,7 +15,7 @@ from headway.models import compilation, fitting
 from headway.models.compilation import in_each_precision
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitSetup, episode_losses, fit_epoch, make_data
-from headway.models.products import product, rounded
+from headway.models.products import affine, rounded
 
 TWO_LAYERS = ModelConfig(
     num_members=2, num_heads=2, hidden_sizes=(8, 8), context_size=3, context_hidden_sizes=(5,)
@@ -38,24 +38,28 @@ def exact(values):
 
 
 def test_reduced_products_and_gradients_are_those_of_rounded_factors():
-    x, weight, gradient = draws(0, 2, 7, 5), draws(1, 2, 5, 4), draws(2, 2, 7, 4)
-    out, back = jax.vjp(lambda *factors: product(*factors, "bfloat16"), x, weight)
-    of_x, of_weight = back(gradient)
-    left, right, above = exact(x), exact(weight), exact(gradient)
-    np.testing.assert_allclose(out, left @ right, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(of_x, above @ right.swapaxes(1, 2), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(of_weight, left.swapaxes(1, 2) @ above, rtol=1e-5, atol=1e-6)
-    assert out.dtype == of_x.dtype == of_weight.dtype == jnp.float32
+    x, weight, bias = draws(0, 2, 5, 7), draws(1, 2, 5, 4), draws(3, 2, 4)
+    gradient = draws(2, 2, 4, 7)
+    out, back = jax.vjp(lambda *layer: affine(*layer, "bfloat16"), x, weight, bias)
+    of_x, of_weight, of_bias = back(gradient)
+    columns, matrix, above = exact(x), exact(weight), exact(gradient)
+    twin = matrix.swapaxes(1, 2) @ columns + np.asarray(bias)[:, :, None]
+    np.testing.assert_allclose(out, twin, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(of_x, matrix @ above, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(of_weight, columns @ above.swapaxes(1, 2), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(of_bias, above.sum(-1), rtol=1e-5, atol=1e-6)
+    assert {part.dtype for part in (out, of_x, of_weight, of_bias)} == {np.dtype("float32")}
 
 
 def test_reduced_products_of_several_seeds_are_those_of_each():
-    x, weight = draws(0, 3, 2, 7, 5), draws(1, 3, 2, 5, 4)
+    layers = draws(0, 3, 2, 5, 7), draws(1, 3, 2, 5, 4), draws(2, 3, 2, 4)
 
-    def size(x, weight):
-        return jnp.square(product(x, weight, "bfloat16")).sum()
+    def size(x, weight, bias):
+        return jnp.square(affine(x, weight, bias, "bfloat16")).sum()
 
-    together = jax.vmap(jax.grad(size, argnums=(0, 1)))(x, weight)
-    alone = [jax.grad(size, argnums=(0, 1))(x[i], weight[i]) for i in range(3)]
+    gradients = jax.grad(size, argnums=(0, 1, 2))
+    together = jax.vmap(gradients)(*layers)
+    alone = [gradients(*(part[i] for part in layers)) for i in range(3)]
     for found, each in zip(together, zip(*alone, strict=True), strict=True):
         np.testing.assert_allclose(found, jnp.stack(each), rtol=1e-5, atol=1e-5)
 

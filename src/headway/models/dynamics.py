@@ -18,7 +18,16 @@ from headway.data import (
     sim_params_row,
 )
 from headway.models.moments import Moments, merge_columns
-from headway.models.networks import Dense, DenseHeads, Normalizer, bound_logvar, in_precision, swish
+from headway.models.networks import (
+    Dense,
+    DenseHeads,
+    Normalizer,
+    bound_logvar,
+    columns_of_each,
+    in_precision,
+    swish,
+)
+from headway.models.products import row_by_row
 from headway.tasks.base import Task
 
 PART_TRANSITIONS = 2**17  # read at once for statistics; the paper's whole data are one part
@@ -84,7 +93,16 @@ class GaussianNet(eqx.Module):
         context: Float[Array, "member batch context"] | None,
     ) -> Prediction:
         """Predict with every head; results are [member, head, batch, obs]."""
-        return self.predict(self.head_input(x, context))
+        mean, logvar = self.columns(x.mT, None if context is None else context.mT)
+        return Prediction(mean.mT, None if logvar is None else logvar.mT)
+
+    def columns(
+        self,
+        x: Float[Array, "member in batch"],
+        context: Float[Array, "member context batch"] | None,
+    ) -> Prediction:
+        """The same with features before samples; results are [member, head, obs, batch]."""
+        return self._predict(self._head_input(x, context))
 
     def head_input(
         self,
@@ -92,16 +110,29 @@ class GaussianNet(eqx.Module):
         context: Float[Array, "member batch context"] | None,
     ) -> Float[Array, "member batch hidden"]:
         """Run the shared hidden layers; where the context joins the heads, it is appended."""
+        return self._head_input(x.mT, None if context is None else context.mT).mT
+
+    def _head_input(
+        self,
+        x: Float[Array, "member in batch"],
+        context: Float[Array, "member context batch"] | None,
+    ) -> Float[Array, "member hidden batch"]:
+        x = row_by_row(x)
         for index, layer in enumerate(self.hidden):
-            x = swish(layer(_joined(x, context) if index == self.context_layer else x))
+            x = swish(layer.columns(_joined(x, context) if index == self.context_layer else x))
         return _joined(x, context) if self.context_layer is None else x
 
     def predict(self, x: Float[Array, "member batch hidden"]) -> Prediction:
         """Run the heads; results are [member, head, batch, obs]."""
+        mean, logvar = self._predict(x.mT)
+        return Prediction(mean.mT, None if logvar is None else logvar.mT)
+
+    def _predict(self, x: Float[Array, "member hidden batch"]) -> Prediction:
         if self.logvar_heads is None:
-            return Prediction(self.mean_heads(x), None)
-        low, high = self.min_logvar[:, None, :], self.max_logvar[:, None, :]
-        return Prediction(self.mean_heads(x), bound_logvar(self.logvar_heads(x), low, high))
+            return Prediction(self.mean_heads.columns(x), None)
+        mean, logvar = columns_of_each((self.mean_heads, self.logvar_heads), x)
+        low, high = self.min_logvar[:, :, None], self.max_logvar[:, :, None]
+        return Prediction(mean, bound_logvar(logvar, low, high))
 
 
 def context_layer(config: ModelConfig) -> int | None:
@@ -124,9 +155,9 @@ def context_size(config: ModelConfig, task: Task, num_sim_params: int) -> int:
 
 
 def _joined(
-    x: Float[Array, "member batch in"], context: Float[Array, "member batch context"] | None
-) -> Float[Array, "member batch wider"]:
-    return x if context is None else jnp.concatenate([x, context], axis=-1)
+    x: Float[Array, "member in batch"], context: Float[Array, "member context batch"] | None
+) -> Float[Array, "member wider batch"]:
+    return x if context is None else jnp.concatenate([x, context], axis=1)
 
 
 class ContextEncoder(eqx.Module):
@@ -148,9 +179,10 @@ class ContextEncoder(eqx.Module):
 
     def __call__(self, x: Float[Array, "member batch in"]) -> Float[Array, "member batch context"]:
         """Encode flattened histories."""
+        x = row_by_row(x.mT)
         for layer in self.hidden:
-            x = jax.nn.relu(layer(x))
-        return self.output(x)
+            x = jax.nn.relu(layer.columns(x))
+        return self.output.columns(x).mT
 
 
 class Statistics(eqx.Module):

@@ -120,8 +120,9 @@ def head_losses(
 
     def losses(net: GaussianNet, start, end, delta) -> Float[Array, "member head sample"]:
         x = network_input(task, statistics, start, batch.action)
-        target = delta.normalize(task.target(start, end))
-        return negative_log_likelihood(net(x, context), target[:, None])
+        target = delta.normalize(task.target(start, end)).mT
+        prediction = net.columns(x.mT, None if context is None else context.mT)
+        return negative_log_likelihood(prediction, target[:, None], axis=-2)
 
     forward = losses(model.forward_net, batch.obs, batch.next_obs, statistics.delta)
     if model.backward_net is None:

@@ -16,16 +16,21 @@ HEAD_DECAY = 1e-4
 
 
 def negative_log_likelihood(
-    prediction: Prediction, target: Float[Array, "*#batch obs"]
-) -> Float[Array, "*#batch"]:
+    prediction: Prediction, target: Float[Array, "..."], axis: int = -1
+) -> Float[Array, "..."]:
     """Gaussian NLL without constants, averaged over dimensions; squared error if deterministic.
 
     `(mean - target)^2 exp(-logvar) + logvar` (released code).
+
+    Args:
+        prediction: What is compared with the target.
+        target: The normalised `delta`, broadcast against it.
+        axis: That of the dimensions, over which the average is.
     """
     squared = jnp.square(prediction.mean - target)
     if prediction.logvar is None:
-        return squared.mean(-1)
-    return (squared * jnp.exp(-prediction.logvar) + prediction.logvar).mean(-1)
+        return squared.mean(axis)
+    return (squared * jnp.exp(-prediction.logvar) + prediction.logvar).mean(axis)
 
 
 def assign_heads(losses: Float[Array, "*batch head segment"]) -> Int[Array, "*batch segment"]:

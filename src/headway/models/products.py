@@ -1,7 +1,8 @@
-"""Products of the networks in a precision, forwards and backwards.
+"""Layers of the networks in a precision, forwards and backwards; features before samples.
 
 Reduced precision rounds what is multiplied; sums are always float32. On CPUs XLA multiplies
-bfloat16 fast (YNNPACK) only where the first factor lies row by row in memory.
+bfloat16 fast (YNNPACK) only where the first factor lies row by row in memory: with features before
+samples only weights have to be transposed for that, which are smaller than activations.
 """
 
 import functools
@@ -9,20 +10,23 @@ import functools
 import jax
 import jax.numpy as jnp
 from jax.experimental.layout import Layout, with_layout_constraint
-from jaxtyping import Array, BFloat16, DTypeLike, Float
+from jaxtyping import Array, DTypeLike, Float
 
 from headway.config import Precision
 
 PRECISIONS = {"float32": jnp.float32, "bfloat16": jnp.bfloat16}
 
 
-def product(
-    x: Float[Array, "member batch in"],
+def affine(
+    x: Float[Array, "member in batch"],
     weight: Float[Array, "member in out"],
+    bias: Float[Array, "member out"],
     precision: Precision,
-) -> Float[Array, "member batch out"]:
-    """Each member's product; its gradient multiplies in the same precision."""
-    return x @ weight if precision == "float32" else _reduced(x, weight)
+) -> Float[Array, "member out batch"]:
+    """Each member's layer; its gradient multiplies in the same precision."""
+    if precision == "float32":
+        return weight.mT @ x + bias[:, :, None]
+    return _reduced(x, weight, bias)
 
 
 def rounded(x: Float[Array, "*shape"], dtype: DTypeLike) -> Float[Array, "*shape"]:
@@ -40,28 +44,33 @@ def rounded(x: Float[Array, "*shape"], dtype: DTypeLike) -> Float[Array, "*shape
 
 @jax.custom_vjp
 def _reduced(
-    x: Float[Array, "member batch in"], weight: Float[Array, "member in out"]
-) -> Float[Array, "member batch out"]:
-    return _forward(x, weight)[0]
+    x: Float[Array, "member in batch"],
+    weight: Float[Array, "member in out"],
+    bias: Float[Array, "member out"],
+) -> Float[Array, "member out batch"]:
+    return _forward(x, weight, bias)[0]
 
 
-def _forward(x, weight):
-    x, weight = x.astype(jnp.bfloat16), weight.astype(jnp.bfloat16)
-    return _sums("mbi,mio->mbo", x, weight), (x, weight)
+def _forward(x, weight, bias):
+    x, weight = row_by_row(x.astype(jnp.bfloat16)), weight.astype(jnp.bfloat16)
+    return _sums("moi,mib->mob", row_by_row(weight.mT), x) + bias[:, :, None], (x, weight)
 
 
 def _backward(factors, gradient):
     x, weight = factors
     gradient = rounded(gradient, jnp.bfloat16)
-    of_x = _sums("mbo,mio->mbi", gradient, weight)
-    return of_x, _sums("mib,mbo->mio", _row_by_row(x.mT), gradient)
+    of_x = _sums("mio,mob->mib", weight, gradient)
+    of_weight = _sums("mib,mob->mio", x, gradient)
+    # Of what is rounded: of the rest nothing is kept, or computed twice.
+    of_bias = gradient.astype(jnp.float32).sum(-1)
+    return of_x, of_weight, of_bias
 
 
 _reduced.defvjp(_forward, _backward)
 _sums = functools.partial(jnp.einsum, preferred_element_type=jnp.float32)
 
 
-def _row_by_row(x: BFloat16[Array, "member row column"]) -> BFloat16[Array, "member row column"]:
+def row_by_row(x: Float[Array, "member row column"]) -> Float[Array, "member row column"]:
     """`x`, laid out so; XLA would multiply the transpose of what is there without moving it."""
     if jax.default_backend() != "cpu":
         return x
