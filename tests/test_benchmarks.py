@@ -32,7 +32,12 @@ GPU_PLAN = Target("plan", "gpu", "a plan", 4.0, "ratio", "")
     ],
 )
 def test_machine_kind_names_the_device(backend, device, kind):
-    assert machine_kind(backend, device, 2) == kind
+    assert machine_kind(backend, device, 2, matrix_units=False) == kind
+
+
+def test_machine_kind_tells_cpus_with_matrix_units_apart():
+    assert machine_kind("cpu", "cpu", 2, matrix_units=True) == "cpu-2-cores-amx"
+    assert machine_kind("gpu", "NVIDIA H100", 2, matrix_units=True) == "h100"
 
 
 def test_report_sets_targets_beside_what_was_measured():
