@@ -100,6 +100,7 @@ def test_softplus_and_its_slope_are_jaxs():
     np.testing.assert_allclose(softplus(x), jax.nn.softplus(x), rtol=1e-6, atol=1e-7)
     slope, twin = (jax.vmap(jax.grad(one))(x) for one in (softplus, jax.nn.softplus))
     np.testing.assert_allclose(slope, twin, rtol=1e-5, atol=1e-7)
+    np.testing.assert_array_equal(softplus(jnp.asarray([-jnp.inf, jnp.inf])), [0.0, jnp.inf])
 
 
 def test_initial_weights_are_truncated_at_two_deviations_and_biases_zero():

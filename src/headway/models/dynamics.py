@@ -39,6 +39,11 @@ class Prediction(NamedTuple):
     mean: Float[Array, "*batch obs"]
     logvar: Float[Array, "*batch obs"] | None
 
+    @property
+    def mT(self) -> "Prediction":  # noqa: N802, as arrays call it
+        """The same with the last two axes exchanged."""
+        return Prediction(self.mean.mT, None if self.logvar is None else self.logvar.mT)
+
 
 class NetSizes(NamedTuple):
     """Widths of what enters and leaves a network."""
@@ -93,8 +98,7 @@ class GaussianNet(eqx.Module):
         context: Float[Array, "member batch context"] | None,
     ) -> Prediction:
         """Predict with every head; results are [member, head, batch, obs]."""
-        mean, logvar = self.columns(x.mT, None if context is None else context.mT)
-        return Prediction(mean.mT, None if logvar is None else logvar.mT)
+        return self.columns(x.mT, None if context is None else context.mT).mT
 
     def columns(
         self,
@@ -124,8 +128,7 @@ class GaussianNet(eqx.Module):
 
     def predict(self, x: Float[Array, "member batch hidden"]) -> Prediction:
         """Run the heads; results are [member, head, batch, obs]."""
-        mean, logvar = self._predict(x.mT)
-        return Prediction(mean.mT, None if logvar is None else logvar.mT)
+        return self._predict(x.mT).mT
 
     def _predict(self, x: Float[Array, "member hidden batch"]) -> Prediction:
         if self.logvar_heads is None:

@@ -157,5 +157,4 @@ def bound_logvar(
 
 def softplus(x: Float[Array, "..."]) -> Float[Array, "..."]:
     """`log(1 + exp(x))`, to 1e-7: without JAX's `log1p`, which takes longer than all the rest."""
-    size = jnp.abs(x)
-    return 0.5 * (x + size) + jnp.log(1.0 + jnp.exp(-size))
+    return jnp.maximum(x, 0.0) + jnp.log(1.0 + jnp.exp(jnp.minimum(x, -x)))
