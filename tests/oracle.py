@@ -19,9 +19,9 @@ from pathlib import Path
 
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")  # compiles twice as fast
 
-import numpy as np  # noqa: E402
+import numpy as np
 
-import headway  # noqa: E402
+import headway
 
 KEPT = Path(__file__).with_suffix(".json")
 TOLERANCE = 1e-5
