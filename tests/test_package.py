@@ -91,15 +91,6 @@ def test_wheel_holds_the_package_and_its_type_marker(tmp_path):
     }
 
 
-@pytest.mark.parametrize("folder", ["src", "tests", "benchmarks", "results"])
-def test_no_file_is_over_400_lines(folder):
-    lengths = {
-        str(path.relative_to(ROOT)): len(path.read_text().splitlines())
-        for path in (ROOT / folder).rglob("*.py")
-    }
-    assert {path: lines for path, lines in lengths.items() if lines > 400} == {}
-
-
 def test_readme_is_short():
     assert len((ROOT / "README.md").read_text().splitlines()) <= 150
 

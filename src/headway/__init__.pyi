@@ -1,0 +1,57 @@
+# Public names and their modules, the only list of them; `__init__.py` loads each at its first use.
+
+from .api import Evaluation as Evaluation
+from .api import Run as Run
+from .api import evaluate as evaluate
+from .api import train as train
+from .api import train_seeds as train_seeds
+from .config import Config as Config
+from .data import ReplayBuffer as ReplayBuffer
+from .data import Trajectory as Trajectory
+from .errors import BadEnvironmentError as BadEnvironmentError
+from .errors import BrokenEpisodeError as BrokenEpisodeError
+from .errors import BusyError as BusyError
+from .errors import ConfigError as ConfigError
+from .errors import DivergenceError as DivergenceError
+from .errors import HeadwayError as HeadwayError
+from .errors import LimitError as LimitError
+from .errors import PlanningError as PlanningError
+from .errors import RunError as RunError
+from .errors import SeedsError as SeedsError
+from .errors import UnknownNameError as UnknownNameError
+from .experiment.learners import Fit as Fit
+from .experiment.learners import Learned as Learned
+from .experiment.learners import Learner as Learner
+from .experiment.learners import register_learner as register_learner
+from .experiment.methods import METHODS as METHODS
+from .experiment.methods import Method as Method
+from .experiment.methods import make_config as make_config
+from .experiment.methods import register_method as register_method
+from .experiment.presets import PRESETS as PRESETS
+from .models.dynamics import MultiHeadDynamics as MultiHeadDynamics
+from .models.updates import EpochStats as EpochStats
+from .planning.agent import Agent as Agent
+from .planning.controller import Controller as Controller
+from .planning.meta.agent import AdaptiveAgent as AdaptiveAgent
+from .planning.meta.function import FunctionModel as FunctionModel
+from .planning.optimizers import CEM as CEM
+from .planning.optimizers import ICEM as ICEM
+from .planning.optimizers import MPPI as MPPI
+from .planning.optimizers import RandomShooting as RandomShooting
+from .report.diagnosis import Diagnosis as Diagnosis
+from .report.diagnosis import diagnose as diagnose
+from .report.dynamics import plot_dynamics as plot_dynamics
+from .report.page.build import write_report as write_report
+from .report.recording import Recording as Recording
+from .report.recording import record as record
+from .service import load as load
+from .sim_params import SimParamSets as SimParamSets
+from .storage.run_dir import RunDir as RunDir
+from .storage.tables import EpisodeRow as EpisodeRow
+from .tasks.base import Task as Task
+from .tasks.catalog import EnvSpec as EnvSpec
+from .tasks.catalog import env_spec as env_spec
+from .tasks.catalog import register as register
+
+__all__: list[str]
+__version__: str
