@@ -4,7 +4,6 @@ from .api import Evaluation as Evaluation
 from .api import Run as Run
 from .api import evaluate as evaluate
 from .api import train as train
-from .api import train_seeds as train_seeds
 from .config import Config as Config
 from .data import ReplayBuffer as ReplayBuffer
 from .data import Trajectory as Trajectory
@@ -17,7 +16,6 @@ from .errors import HeadwayError as HeadwayError
 from .errors import LimitError as LimitError
 from .errors import PlanningError as PlanningError
 from .errors import RunError as RunError
-from .errors import SeedsError as SeedsError
 from .errors import UnknownNameError as UnknownNameError
 from .experiment.learners import Fit as Fit
 from .experiment.learners import Learned as Learned

@@ -1,22 +1,19 @@
 """What most users need: train, evaluate; `headway.service` loads."""
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
 
 from headway.config import Config
-from headway.errors import ConfigError, shown
 from headway.experiment.evaluation import PlanningCost, episode_rows
 from headway.experiment.methods import make_config
 from headway.experiment.progress import Progress
-from headway.experiment.seeds import train_seeds as train_together
 from headway.experiment.testing import run_tests
 from headway.experiment.training import train_run
 from headway.planning.controller import Controller
 from headway.report.figures import save_run_figures
 from headway.service import load
-from headway.storage.run_dir import RunDir
 from headway.storage.tables import EpisodeRow
 
 
@@ -128,74 +125,6 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
         resume_from_last_good=resume_from_last_good,
         ignore_limits=ignore_limits,
     )
-    return _finished(run, config)
-
-
-def train_seeds(  # noqa: PLR0913 (keywords, all but the seeds with a default)
-    env: str,
-    *,
-    seeds: Iterable[int],
-    method: str = "tmcl",
-    preset: str = "paper",
-    run_dir: str | Path | None = None,
-    settings: Mapping[str, Any] | None = None,
-    progress: Progress | None = None,
-    resume_from_last_good: bool = False,
-    ignore_limits: bool = False,
-) -> list[Run]:
-    """Train several seeds of one configuration together, in one program.
-
-    Each seed is a run of its own, as `train` would have made it, within rounding; begun ones go
-    on where they stand. On a GPU, where small networks leave most of it idle, several seeds
-    take little longer than one.
-
-    Args:
-        env: Short name or id of an environment.
-        seeds: Each makes a run.
-        method: A name from `headway list methods`.
-        preset: A name from `headway list presets`.
-        run_dir: A folder that gets a directory `seedSEED` for each run; by default the runs go
-            where `train` puts them.
-        settings: Changes by dotted name, for example `{"planner.horizon": 20}`.
-        progress: Shown while training; silent by default.
-        resume_from_last_good: Where a file of a run is damaged, go back to the newest iteration
-            whose files are all intact.
-        ignore_limits: Try what seems too large for the free memory.
-
-    Returns:
-        The runs, in the order of the seeds.
-
-    Raises:
-        UnknownNameError: No such environment, method or preset.
-        ConfigError: A setting is unknown, of the wrong type or out of range; or there is no
-            seed, or one twice.
-        RunError: A directory holds something else, is damaged, or in use; no run has begun then.
-        LimitError: The runs together need more memory than is free.
-        SeedsError: Some seeds failed, and the others are finished.
-    """
-    chosen = list(seeds)
-    if not chosen or len(set(chosen)) < len(chosen):
-        raise ConfigError(f"seeds is {shown(chosen)}, allowed: one or more, each once.")
-    configs = [
-        make_config(env, method=method, preset=preset, seed=seed, settings=settings)
-        for seed in chosen
-    ]
-    places = [
-        default_run_dir(config) if run_dir is None else Path(run_dir) / f"seed{config.seed}"
-        for config in configs
-    ]
-    runs = train_together(
-        configs[0],
-        dict(zip(chosen, places, strict=True)),
-        progress,
-        resume_from_last_good=resume_from_last_good,
-        ignore_limits=ignore_limits,
-    )
-    return [_finished(run, config) for run, config in zip(runs, configs, strict=True)]
-
-
-def _finished(run: RunDir, config: Config) -> Run:
-    """Draw a run's figures, and read what it measured."""
     return Run(run.path, config, run.metrics(), run.evaluation(), save_run_figures(run.path))
 
 

@@ -55,19 +55,6 @@ class LimitError(HeadwayError, RuntimeError):
     """The machine lacks the memory or the disk that a run needs."""
 
 
-class SeedsError(HeadwayError, RuntimeError):
-    """Some of the seeds that were trained together failed; the others are finished.
-
-    Args:
-        text: What happened.
-        failures: Why, by seed.
-    """
-
-    def __init__(self, text: str, failures: dict[int, HeadwayError]):
-        super().__init__(text)
-        self.failures = failures
-
-
 def shown(value: Any) -> str:
     """A value as it stands in a message: like `repr`, but never long."""
     try:

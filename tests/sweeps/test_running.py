@@ -6,13 +6,10 @@ import shutil
 from pathlib import Path
 
 import fakes
-import jax
 import pytest
 from rich.console import Console
 
-from headway.errors import ConfigError, RunError, SeedsError
-from headway.experiment import seeds
-from headway.experiment.methods import make_config
+from headway.errors import ConfigError, RunError
 from headway.storage.run_dir import RunDir
 from headway.storage.run_lock import LOCK, locked
 from headway.sweeps import running
@@ -133,34 +130,6 @@ def test_an_error_that_is_not_headways_does_not_stop_the_others(training, tmp_pa
     assert jobs[1].finished
 
 
-def test_memory_that_runs_out_together_lets_each_seed_try_alone(training, tmp_path, monkeypatch):
-    def too_large(*args, **options):
-        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory\nallocating 9 GiB")
-
-    monkeypatch.setattr(running, "train_seeds", too_large)
-    training.answers = {0: [jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: again")]}
-    jobs = [fakes.tiny_job(tmp_path, seed) for seed in (0, 1)]
-    board = fakes.Remembering()
-    run_jobs(jobs, Workers(seeds_together=True), board)
-    assert [text.endswith("Out of memory allocating 9 GiB") for text in board.messages] == [True]
-    assert [note.endswith("again") for note in board.failures.values()] == [True]
-    assert jobs[1].finished
-
-
-def test_a_busy_seed_that_learns_nothing_is_tried_again(training, tmp_path, monkeypatch):
-    jobs = [
-        Job.of(make_config("pendulum", method="random", preset="smoke", seed=seed), tmp_path)
-        for seed in (0, 1)
-    ]
-    monkeypatch.setattr(seeds, "train_run", training)
-    training.answers = {0: [fakes.BUSY]}
-    board = fakes.Remembering()
-    run_jobs(jobs, Workers(seeds_together=True), board)
-    assert training.calls == [("random", 0), ("random", 1), ("random", 0)]
-    assert board.failures == {}
-    assert [state for state in board.states(jobs[0]) if state != "running"] == ["busy", "done"]
-
-
 def test_without_ray_it_says_what_to_install(training, tmp_path, monkeypatch):
     monkeypatch.setattr(running, "ray_is_installed", lambda: False)
     jobs = [fakes.tiny_job(tmp_path, seed) for seed in (0, 1)]
@@ -172,70 +141,13 @@ def test_without_ray_it_says_what_to_install(training, tmp_path, monkeypatch):
         run_jobs([fakes.tiny_job(tmp_path, 2)], Workers(address="auto"), board)
 
 
-def test_seeds_of_a_configuration_are_trained_together(training, tmp_path, monkeypatch):
-    groups = []
-
-    def together(config, places, *, of_seed):
-        groups.append((config.planner.horizon, tuple(places)))
-        for seed in places:
-            if seed != 1:
-                job = next(job for job in jobs if job.path == places[seed])
-                fakes.write_run(job.config, job.path, of_seed[seed])
-        raise SeedsError("one stopped", {1: fakes.DIVERGED})
-
-    monkeypatch.setattr(running, "train_seeds", together)
-    horizons = [{}, {"planner.horizon": 2}]
-    jobs = [fakes.tiny_job(tmp_path, seed, **h) for seed in (0, 1, 2) for h in horizons]
-    jobs = jobs[:5]  # the second configuration has seeds 0 and 1 only
-    board = fakes.Remembering()
-    run_jobs(jobs, Workers(seeds_together=True), board)
-    assert groups == [(3, (0, 1, 2)), (2, (0, 1))]
-    assert training.calls == []
-    assert board.failures == {jobs[2].path: "no finite number", jobs[3].path: "no finite number"}
-    assert all(board.statuses[jobs[i].path].state == "done" for i in (0, 1, 4))
-    assert board.statuses[jobs[4].path].returns == "collected 43 ± 1"
-
-
-def test_a_seed_whose_directory_was_damaged_meanwhile_does_not_stop_the_sweep(
-    training, tmp_path, monkeypatch
-):
-    together = [fakes.tiny_job(tmp_path, seed) for seed in (0, 1)]
-    alone = fakes.tiny_job(tmp_path, **{"planner.horizon": 2})
-
-    def damaged(config, places, *, of_seed):
-        for job in together:
-            fakes.write_run(job.config, job.path, of_seed[job.config.seed])
-        (together[1].path / "config.json").write_text("{")
-        raise SeedsError("one stopped", {1: fakes.DIVERGED})
-
-    monkeypatch.setattr(running, "train_seeds", damaged)
-    board = fakes.Remembering()
-    run_jobs([*together, alone], Workers(seeds_together=True), board)
-    assert board.failures == {together[1].path: "no finite number"}
-    assert alone.finished
-
-
-def test_seeds_that_cannot_be_begun_together_go_one_by_one(training, tmp_path, monkeypatch):
-    def together(*args, **options):
-        raise fakes.BUSY
-
-    monkeypatch.setattr(running, "train_seeds", together)
-    jobs = [fakes.tiny_job(tmp_path, seed) for seed in (0, 1)]
-    board = fakes.Remembering()
-    run_jobs(jobs, Workers(seeds_together=True), board)
-    assert [seed for _, seed in training.calls] == [0, 1]
-    assert board.messages == [f"each seed by itself, because {fakes.BUSY}"]
-
-
 @pytest.mark.parametrize(
     "wrong",
     [
         {"cpus_per_run": 0},
         {"gpus_per_run": -1},
         {"one_by_one": True, "address": "auto"},
-        {"seeds_together": True, "address": "auto"},
         {"one_by_one": True, "cpus_per_run": 2},
-        {"seeds_together": True, "gpus_per_run": 0},
         {"gpus_per_run": 1.5},
     ],
 )

@@ -102,13 +102,8 @@ class Train:
     """At which scale; `headway list presets` shows the choice."""
     seed: int = 0
     """Makes the run repeatable."""
-    seeds: Annotated[
-        tuple[str, ...],
-        tyro.conf.arg(metavar="SEED|FROM:TO", help_behavior_hint="(default: only --seed)"),
-    ] = ()
-    """Seeds that are trained together in one program, each as a run of its own: 0:3 is 0 1 2."""
     run_dir: Annotated[Path | None, default_text("runs/ENV-METHOD-PRESET-seedSEED")] = None
-    """Where everything is written; with --seeds, a folder with a directory seedSEED for each."""
+    """Where everything is written."""
     sim_params: Annotated[Path | None, default_text("the environment's own")] = None
     """A JSON file with the training and unseen physics."""
     env_options: Annotated[tuple[str, ...], default_text("those of the preset")] = ()

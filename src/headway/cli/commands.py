@@ -19,7 +19,6 @@ from headway.cli.defaults import parse_for_run, parse_twice
 from headway.cli.output import print_json as _print_json
 from headway.cli.output import print_tables as _print_tables
 from headway.cli.reports import diagnose, record, report
-from headway.cli.seeds import read_seeds
 from headway.cli.usage import UsageError, parse
 from headway.config import Config
 from headway.errors import ConfigError, unknown_name
@@ -36,42 +35,30 @@ MAX_SIM_PARAMS_BYTES = 2**20
 def train(words: Sequence[str]) -> int:
     """`headway train`."""
     arguments, settings = parse_train(words)
-    runs = _train(arguments, settings)
-    if arguments.json:
-        facts = list(map(_facts, runs))
-        return _print_json({"runs": facts} if arguments.seeds else facts[0])
-    config, seeds = runs[0].config, ", ".join(str(run.config.seed) for run in runs)
-    title = f"{config.env}, {config.method} after {len(runs[0].metrics)} iterations"
-    rows = [row for run in runs for row in _last_rows(run)]
-    _print_evaluation(rows, config, f"{title}, seeds {seeds}" if arguments.seeds else title)
-    again = "The command, which resumes what was interrupted"
-    for heading, lines in (
-        ("Figures", [str(path) for run in runs for path in run.figures]),
-        ("Test it again", [shlex.join(["headway", "evaluate", str(run.path)]) for run in runs]),
-        (again, [shlex.join(["headway", "train", *words])]),
-    ):
-        print(f"{heading}:", *lines, sep="\n  ")
-    return 0
-
-
-def _train(arguments: Train, settings: dict[str, Any]) -> "list[Run]":
     from headway import api
     from headway.experiment.progress import make_progress
 
-    if arguments.seed and arguments.seeds:
-        raise UsageError("--seed and --seeds are given, allowed: one of them.")
-    options: dict[str, Any] = {
-        "method": arguments.method,
-        "preset": arguments.preset,
-        "run_dir": arguments.run_dir,
-        "settings": settings,
-        "progress": make_progress(arguments.quiet),
-        "resume_from_last_good": arguments.resume_from_last_good,
-        "ignore_limits": arguments.ignore_limits,
-    }
-    if arguments.seeds:
-        return api.train_seeds(arguments.env, seeds=read_seeds(arguments.seeds), **options)
-    return [api.train(arguments.env, seed=arguments.seed, **options)]
+    run = api.train(
+        arguments.env,
+        method=arguments.method,
+        preset=arguments.preset,
+        seed=arguments.seed,
+        run_dir=arguments.run_dir,
+        settings=settings,
+        progress=make_progress(arguments.quiet),
+        resume_from_last_good=arguments.resume_from_last_good,
+        ignore_limits=arguments.ignore_limits,
+    )
+    if arguments.json:
+        return _print_json(_facts(run))
+    config = run.config
+    title = f"{config.env}, {config.method} after {len(run.metrics)} iterations"
+    _print_evaluation(_last_rows(run), config, title)
+    print("Figures:", *run.figures, sep="\n  ")
+    print("Test it again:", shlex.join(["headway", "evaluate", str(run.path)]), sep="\n  ")
+    again = shlex.join(["headway", "train", *words])
+    print("The command, which resumes what was interrupted:", again, sep="\n  ")
+    return 0
 
 
 def _last_rows(run: "Run") -> "list[EpisodeRow]":

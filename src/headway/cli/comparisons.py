@@ -39,9 +39,6 @@ class _Runs:
     """List what would be run and about how long it takes, and run nothing."""
     one_by_one: Flag = False
     """Let runs go one after another in this process, even where Ray is installed."""
-    seeds_together: Flag = False
-    """Train the seeds of each configuration in one program, in this process and without Ray; on a
-    GPU small networks gain by it."""
     address: Annotated[str | None, default_text("Ray on this machine")] = None
     """A Ray cluster, for example `auto`; it must see --out under the same path."""
     cpus_per_run: float = 1.0
@@ -146,7 +143,6 @@ def _compare(
         arguments.address,
         arguments.cpus_per_run,
         arguments.gpus_per_run,
-        arguments.seeds_together,
     )
     board = make_board(arguments.quiet)
     done = compare.reproduce(comparison, workers=workers, board=board, command=command)

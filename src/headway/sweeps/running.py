@@ -1,17 +1,12 @@
-"""Making the runs that are missing: one after another here, or side by side on Ray.
-
-Here, the seeds of one configuration may also be trained together, in one program.
-"""
+"""Making the runs that are missing: one after another here, or side by side on Ray."""
 
 import dataclasses
 import functools
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.util import find_spec
-from pathlib import Path
 
-from headway.errors import BusyError, ConfigError, SeedsError
-from headway.experiment.seeds import train_seeds
+from headway.errors import BusyError, ConfigError
 from headway.experiment.training import train_run
 from headway.sweeps.board import Board, first_status
 from headway.sweeps.jobs import Job
@@ -33,8 +28,6 @@ class Workers:
     """Cores that one run reserves, and threads that it computes with."""
     gpus_per_run: float | None = None
     """GPUs, or a fraction of one, that one run reserves; None takes one where there are any."""
-    seeds_together: bool = False
-    """Whether the seeds of a configuration are trained in one program, in this process."""
 
     def __post_init__(self):
         gpus = 0.0 if self.gpus_per_run is None else self.gpus_per_run
@@ -52,13 +45,12 @@ class Workers:
             "cpus_per_run": None if self.cpus_per_run == 1 else self.cpus_per_run,
             "gpus_per_run": self.gpus_per_run,
         }
-        for name in ("one_by_one", "seeds_together"):
-            for other, value in of_ray.items():
-                if getattr(self, name) and value is not None:
-                    raise ConfigError(
-                        f"{name} makes runs without Ray, got {other} {value!r}, which only Ray"
-                        " heeds; leave one out."
-                    )
+        for other, value in of_ray.items():
+            if self.one_by_one and value is not None:
+                raise ConfigError(
+                    f"one_by_one makes runs without Ray, got {other} {value!r}, which only Ray"
+                    " heeds; leave one out."
+                )
 
 
 def run_jobs(jobs: Sequence[Job], workers: Workers, board: Board) -> None:
@@ -73,9 +65,7 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, board: Board) -> None:
     missing = [job for job in jobs if not board.statuses[job.path].over]
     if not missing:
         return
-    if workers.seeds_together:
-        run_here(missing, board, seeds_together=True)
-    elif workers.one_by_one or not ray_is_installed():
+    if workers.one_by_one or not ray_is_installed():
         if workers.address:
             raise ConfigError(
                 f"a Ray cluster needs Ray, which is missing; {INSTALL_RAY} installs it."
@@ -94,56 +84,22 @@ def ray_is_installed() -> bool:
     return find_spec("ray") is not None
 
 
-def run_here(jobs: Sequence[Job], board: Board, *, seeds_together: bool = False) -> None:
+def run_here(jobs: Sequence[Job], board: Board) -> None:
     """Make runs in this process, in their order; those that another process holds come last.
 
     Args:
         jobs: The runs.
         board: Takes reports.
-        seeds_together: Train runs that differ in nothing but the seed in one program.
     """
     waiting = list(jobs)
     while waiting:
-        for group in seeds_of_each(waiting) if seeds_together else [[job] for job in waiting]:
-            make_together(group, board)
+        for job in waiting:
+            ended = make_run(job, functools.partial(board.tell, job))
+            returns = ended.returns or board.statuses[job.path].returns
+            board.tell(job, dataclasses.replace(ended, returns=returns))
         waiting = [job for job in waiting if not board.statuses[job.path].over]
         if waiting:
             time.sleep(PATIENCE)
-
-
-def seeds_of_each(jobs: Sequence[Job]) -> list[list[Job]]:
-    """The jobs of each configuration; these lie in one folder."""
-    groups: dict[Path, list[Job]] = {}
-    for job in jobs:
-        groups.setdefault(job.path.parent, []).append(job)
-    return list(groups.values())
-
-
-def make_together(jobs: Sequence[Job], board: Board) -> None:
-    """Train runs that differ in nothing but the seed, each to its end or its own failure."""
-    failures: Mapping[int, Exception] = {}
-    if len(jobs) > 1:
-        told = {
-            job.config.seed: StatusProgress(
-                functools.partial(board.tell, job), first_status(job).iteration
-            )
-            for job in jobs
-        }
-        places = {job.config.seed: job.path for job in jobs}
-        try:
-            train_seeds(jobs[0].config, places, of_seed=told)
-        except SeedsError as error:
-            failures = error.failures
-        except Exception as error:  # alone, what is at fault fails alone
-            board.message(f"each seed by itself, because {reason(error)}")
-    for job in jobs:  # what is finished by now is not made again
-        failure = failures.get(job.config.seed)
-        if failure is None:
-            ended = make_run(job, functools.partial(board.tell, job))
-        else:
-            ended = _stopped(failure, first_status(job).iteration)
-        returns = ended.returns or board.statuses[job.path].returns
-        board.tell(job, dataclasses.replace(ended, returns=returns))
 
 
 def make_run(job: Job, tell: Tell) -> Status:
