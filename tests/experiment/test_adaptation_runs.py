@@ -46,7 +46,7 @@ def test_the_prior_of_a_loaded_agent_comes_from_all_its_data(old_run):
 
 
 def test_what_was_learned_survives_a_stop_in_the_middle_of_an_episode(old_run, tmp_path):
-    settings = LAST_LAYER | {"planner.change_threshold": 5.0, "planner.head_selection": "evidence"}
+    settings = LAST_LAYER | {"planner.change_threshold": 5.0}
     agent = loading.load_agent(
         RunDir(old_run), config_to_evaluate(RunDir(old_run).config(), settings)
     )

@@ -206,7 +206,6 @@ def test_episodes_that_end_early_are_learned_from(tmp_path):
         ({"planner.num_candidates": 8}, 2 * 8),
         ({"planner.optimizer": "icem"}, 16 + 12 + 2 * 1 + 1),
         ({"planner.optimizer": "mppi", "planner.num_iterations": 3}, 3 * 16),
-        ({"planner.settle_tolerance": 10.0, "planner.num_iterations": 9}, 16),
     ],
 )
 def test_a_run_can_be_tested_with_another_planner(settings, evaluations, reference):

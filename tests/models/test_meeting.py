@@ -209,7 +209,6 @@ def test_a_fit_and_a_plan_of_several_seeds_equal_those_of_each(precision):
     setup = FitSetup(POINT, fitting, SMALL.history_length)
     planner = PlannerConfig(
         horizon=3, num_candidates=8, num_elites=3, num_iterations=3, num_particles=2,
-        settle_tolerance=0.2,
     )  # fmt: skip
 
     def run(seed):

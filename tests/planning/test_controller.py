@@ -50,8 +50,6 @@ def play(controller, steps, obs=OBS):
 
 OPTIMIZERS = [
     {},
-    {"warm_variance": True},
-    {"settle_tolerance": 0.2},
     {"optimizer": "icem"},
     {"optimizer": "mppi"},
     {"optimizer": "random-shooting"},

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import os
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -114,40 +113,6 @@ print(len(compiled))
 
 def test_devices_that_share_a_plan_compile_it_once():
     assert printed_by(python(COMPILED_PROGRAM)).split() == ["True", "0"]
-
-
-SHARED_PROGRAM = """
-import json, sys, jax
-jax.config.update("jax_num_cpu_devices", 1)
-jax.config.update("jax_cpu_collectives_implementation", "gloo")
-jax.distributed.initialize(sys.argv[1], num_processes=2, process_id=int(sys.argv[2]))
-from planning import test_devices
-agent = test_devices.make_agent(**json.loads(sys.argv[3]))
-found = test_devices.actions(agent).tolist()
-_, decision = agent.act(agent.init(1, key=jax.random.key(0)), [[0.0, 0.0]])
-print(json.dumps([len(jax.local_devices()), len(decision.action.sharding.device_set), found]))
-"""
-
-
-@pytest.mark.parametrize("optimizer", ["cem", pytest.param("mppi", marks=pytest.mark.slow)])
-def test_two_processes_that_share_a_plan_choose_the_actions_of_one(optimizer):
-    settings = json.dumps({"optimizer": optimizer, "devices": "all"})
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        address = f"localhost:{free.getsockname()[1]}"
-    workers = [python(SHARED_PROGRAM, address, str(process), settings) for process in (0, 1)]
-    try:
-        answers = [worker.communicate(timeout=120) for worker in workers]
-    finally:
-        for worker in workers:
-            worker.kill()
-    for worker, (_, errors) in zip(workers, answers, strict=True):
-        assert worker.returncode == 0, errors[-2000:]
-    alone = actions(make_agent(optimizer=optimizer))
-    for out, _ in answers:
-        own, sharing, found = json.loads(out.splitlines()[-1])
-        assert (own, sharing) == (1, 2)
-        np.testing.assert_allclose(np.array(found), alone, atol=1e-5)
 
 
 def test_reduced_precision_chooses_nearly_the_same_actions():

@@ -40,13 +40,3 @@ def test_a_plan_of_each_optimizer(optimizer, evaluations):
 
 def test_what_was_really_evaluated_counts_if_it_is_known():
     assert plan_flop(MODEL, PLANNER, toys.POINT, 55.5) == 55.5 * 10 * 5 * PER_STEP
-
-
-def test_knowing_what_is_uncertain_costs_a_product_of_the_features():
-    knowing = dataclasses.replace(PLANNER, adaptation="last-layer", adaptation_variance=True)
-    features = 6 + MODEL.context_size + 1
-    assert step_flop(MODEL, knowing, toys.POINT) == PER_STEP + 2 * 6 * features
-    assert step_flop(MODEL, dataclasses.replace(knowing, adaptation="none"), toys.POINT) == PER_STEP
-    earlier = dataclasses.replace(MODEL, context_at="input")
-    found = step_flop(earlier, knowing, toys.POINT)
-    assert found == step_flop(earlier, PLANNER, toys.POINT) + 2 * 6 * (6 + 1)

@@ -15,7 +15,6 @@ from headway.planning.last_layer.regression import (
     Shape,
     credence,
     forecast,
-    forget,
     log_likelihood,
     update,
 )
@@ -31,7 +30,7 @@ def some_prior(ratio=0.5, *, shaped=False):
         roots = turn * np.geomspace(0.1, 2.0, FEATURES)
         shape = Shape(*(jnp.asarray(x, jnp.float32) for x in (roots, np.linalg.inv(roots))))
     ratios = jnp.asarray([ratio, 2.0 * ratio])
-    return Prior(ratios, jnp.asarray([[0.1, 0.2], [0.3, 0.4]]), jnp.zeros(MEMBERS), shape)
+    return Prior(ratios, jnp.asarray([[0.1, 0.2], [0.3, 0.4]]), shape)
 
 
 def prior_covariance(prior, member):
@@ -42,7 +41,7 @@ def prior_covariance(prior, member):
     return float(prior.ratio[member]) * root @ root.T
 
 
-def some_transitions(steps, groups=1, seed=0):
+def some_transitions(steps, seed=0):
     """Transitions [step, env, ...] whose features are correlated and of unequal sizes."""
     rng = np.random.default_rng(seed)
     mixing = rng.normal(size=(FEATURES, FEATURES)) * np.geomspace(1.0, 0.01, FEATURES)
@@ -51,8 +50,7 @@ def some_transitions(steps, groups=1, seed=0):
     truth = rng.normal(size=(ENVS, MEMBERS, HEADS, FEATURES, OBS))
     residual = np.einsum("semi,emhio->semho", features, truth)
     residual += 0.1 * rng.normal(size=residual.shape)
-    noise = rng.uniform(0.3, 3.0, (steps, ENVS, MEMBERS, groups)) if groups > 1 else 1.0
-    noise = np.broadcast_to(noise, (steps, ENVS, MEMBERS, groups))
+    noise = rng.uniform(1.0, 3.0, (steps, ENVS, MEMBERS, 1))
     return Observed(*(jnp.asarray(x, jnp.float32) for x in (features, residual, noise)))
 
 
@@ -64,28 +62,26 @@ def learn_all(state, transitions):
     return jax.lax.scan(step, state, transitions)[0]
 
 
-def fresh(prior, groups=1):
-    return LastLayer.of_prior(prior, ENVS, (HEADS, FEATURES, OBS), groups=groups)
+def fresh(prior):
+    return LastLayer.of_prior(prior, ENVS, (HEADS, FEATURES, OBS))
 
 
-def batch_posterior(prior, transitions, env, member, head, group):
+def batch_posterior(prior, transitions, env, member, head):
     """Mean and covariance (over the noise variance) of Bayesian linear regression, float64."""
     f, r, n = (np.asarray(x, np.float64)[:, env, member] for x in transitions)
-    whitened = f / n[:, group, None]
+    whitened = f / n
     precision = np.linalg.inv(prior_covariance(prior, member)) + whitened.T @ f
     return np.linalg.solve(precision, whitened.T @ r[:, head]), np.linalg.inv(precision)
 
 
 @pytest.mark.parametrize("shaped", [False, True])
-@pytest.mark.parametrize("groups", [1, HEADS])
-def test_a_thousand_updates_equal_batch_regression_in_float64(groups, shaped):
-    prior, transitions = some_prior(shaped=shaped), some_transitions(1000, groups)
-    state = learn_all(fresh(prior, groups), transitions)
+def test_a_thousand_updates_equal_batch_regression_in_float64(shaped):
+    prior, transitions = some_prior(shaped=shaped), some_transitions(1000)
+    state = learn_all(fresh(prior), transitions)
     for env, member, head in np.ndindex(ENVS, MEMBERS, HEADS):
-        group = min(head, groups - 1)
-        mean, covariance = batch_posterior(prior, transitions, env, member, head, group)
+        mean, covariance = batch_posterior(prior, transitions, env, member, head)
         np.testing.assert_allclose(state.weight[env, member, head], mean, atol=1e-5)
-        root = np.asarray(state.root, np.float64)[env, member, group]
+        root = np.asarray(state.root, np.float64)[env, member, 0]
         np.testing.assert_allclose(root @ root.T, covariance, atol=1e-5)
 
 
@@ -95,9 +91,6 @@ def test_a_prior_of_zero_never_learns(shaped):
     state = learn_all(fresh(prior), some_transitions(50))
     assert not np.asarray(state.weight).any()
     assert not np.asarray(state.root).any()
-    forgotten = forget(state, prior, 0.1)
-    assert not np.asarray(forgotten.weight).any()
-    assert np.isfinite(forgotten.root).all()
 
 
 @pytest.mark.parametrize("shaped", [False, True])
@@ -118,28 +111,6 @@ def test_a_hundred_thousand_updates_stay_finite_and_within_the_prior(shaped):
     assert (diagonal <= largest).all()
     residual = np.asarray(forecast(state, jax.tree.map(lambda x: x[0], transitions)).innovation)
     assert np.square(residual).mean() < 0.1
-
-
-@pytest.mark.parametrize("shaped", [False, True])
-def test_forgetting_is_the_drift_whose_stationary_distribution_is_the_prior(shaped):
-    """Against Gaussian-process regression with weights of correlation (1 - share)^(|t - s| / 2)."""
-    prior, share, steps = some_prior(shaped=shaped), 0.2, 12
-    transitions = some_transitions(steps)
-    state = fresh(prior)
-    for step in range(steps):
-        seen = jax.tree.map(lambda x, step=step: x[step], transitions)
-        state = forget(state, prior, share)
-        expected = forecast(state, seen)
-        state = update(state, seen, expected)
-    f, r, _ = (np.asarray(x, np.float64)[:, 0, 1] for x in transitions)
-    lag = np.abs(np.subtract.outer(range(steps), range(steps)))
-    kernel = f @ prior_covariance(prior, 1) @ f.T * (1 - share) ** (lag / 2)
-    past = np.linalg.solve(kernel[:-1, :-1] + np.eye(steps - 1), r[:-1, 2])
-    mean = kernel[-1, :-1] @ past
-    np.testing.assert_allclose(expected.innovation[0, 1, 2], r[-1, 2] - mean, atol=1e-4)
-    solved = np.linalg.solve(kernel[:-1, :-1] + np.eye(steps - 1), kernel[:-1, -1])
-    variance = 1.0 + kernel[-1, -1] - kernel[-1, :-1] @ solved
-    np.testing.assert_allclose(expected.spread[0, 1, 0], variance, rtol=1e-4)
 
 
 @pytest.mark.parametrize("steps", [0, 6])
@@ -168,13 +139,12 @@ def test_likelihood_is_that_of_regression_with_unknown_noise(steps):
         assert found[env, member, head] == pytest.approx(expected, rel=1e-3, abs=1e-2)
 
 
-@pytest.mark.parametrize("groups", [1, HEADS])
-def test_a_transition_is_believed_as_the_slope_of_its_likelihood_says(groups):
+def test_a_transition_is_believed_as_the_slope_of_its_likelihood_says():
     """A Gaussian error x pulls by x / var; under Student's t it pulls by a share of that."""
-    prior, transitions = some_prior(shaped=True), some_transitions(9, groups)
+    prior, transitions = some_prior(shaped=True), some_transitions(9)
     before, last = (jax.tree.map(lambda x, part=part: x[part], transitions)
                     for part in (slice(8), 8))  # fmt: skip
-    state = learn_all(fresh(prior, groups), before)
+    state = learn_all(fresh(prior), before)
     expected = forecast(state, last)
     var = expected.spread[..., None] * state.noise(prior)
     errors = jnp.asarray([1.5, 4.0, 60.0])[:HEADS, None]  # in deviations, alike in all dimensions
@@ -183,8 +153,7 @@ def test_a_transition_is_believed_as_the_slope_of_its_likelihood_says(groups):
         expected.innovation
     )
     share = np.asarray(-slope * var / expected.innovation)[..., 0]
-    if groups == 1:
-        share = share.max(-1, keepdims=True)
+    share = share.max(-1, keepdims=True)
     np.testing.assert_allclose(credence(expected, state, prior), share, rtol=1e-4)
     near = expected._replace(innovation=0.9 * jnp.sqrt(var))
     np.testing.assert_array_equal(credence(near, state, prior), 1.0)
@@ -218,16 +187,6 @@ def test_a_head_that_is_absurd_alone_keeps_the_others_from_nothing(value, taken)
     assert (np.asarray(found.learned_from) == 1).all()
     np.testing.assert_array_equal(found.residual[0, 1, 1:], residual[0, 1, 1:])
     assert (np.asarray(found.residual[0, 1, 0]) == taken).all()
-
-
-def test_the_noise_of_heads_is_relative_to_what_they_claim_on_average():
-    features, residual, _ = (x[0] for x in some_transitions(1))
-    logvar = jnp.log(jnp.asarray([1.0, 4.0, 1e9])[:, None] * jnp.asarray([0.5, 2.0]))
-    seen = Seen(features, residual, jnp.broadcast_to(logvar, residual.shape))
-    reference = jnp.log(jnp.asarray([1.0, 2.0]))
-    noise = Observed.of(seen, jnp.ones(ENVS, bool), reference).noise
-    wanted = [[1.0, 4.0, np.exp(7)], [0.5, 2.0, np.exp(7)]]
-    np.testing.assert_allclose(noise, [wanted] * ENVS, rtol=1e-5)
 
 
 def test_what_cannot_be_learned_from_counts_for_nothing():

@@ -119,8 +119,6 @@ def test_settings_reach_the_optimizer():
         num_candidates=9, num_elites=3, num_iterations=2, smoothing=0.3, initial_std=0.4
     )
     assert make_optimizer(config) == CEM(9, 3, 2, 0.3, 0.4)
-    warm = dataclasses.replace(config, warm_variance=True, warm_min_std=0.2, settle_tolerance=0.1)
-    assert make_optimizer(warm) == CEM(9, 3, 2, 0.3, 0.4, True, 0.2, 0.1)
     memory = {"noise_beta": 1.5, "population_decay": 1.1, "kept_elite_fraction": 0.7}
     icem = dataclasses.replace(config, optimizer="icem", **memory)
     assert make_optimizer(icem) == ICEM(9, 3, 2, 0.3, 0.4, **memory)

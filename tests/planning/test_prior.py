@@ -1,4 +1,4 @@
-"""The prior from the data: the likelihood it maximises, and what it finds in known data."""
+"""The prior from the data: its most likely noise, and what it finds in known data."""
 
 import dataclasses
 
@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import toys
-from headway.config import PlannerConfig
 from headway.planning.last_layer import foresight
 from headway.planning.last_layer.evidence import Evidence
 from headway.planning.last_layer.prior import fit_prior
@@ -23,71 +22,34 @@ def episodes(ratio, noise_std, count=20, seed=0):
     rows = []
     for _ in range(count):
         features = rng.normal(size=(STEPS, FEATURES)) * np.geomspace(1.0, 0.1, FEATURES)
-        relative = rng.uniform(0.5, 2.0, STEPS)
         weight = rng.normal(size=(FEATURES, OBS)) * np.sqrt(ratio) * noise_std
-        error = rng.normal(size=(STEPS, OBS)) * noise_std * np.sqrt(relative)[:, None]
-        rows.append((features, features @ weight + error, relative))
+        error = rng.normal(size=(STEPS, OBS)) * noise_std
+        rows.append((features, features @ weight + error))
     return rows
 
 
-def test_the_likelihood_is_that_of_jointly_gaussian_residuals():
-    ratio, rows = 3.0, episodes(2.0, np.array([0.1, 0.3]), count=3)
-    evidence = Evidence.of(rows)
-    noise, total = evidence.noise(ratio), 0.0
-    for features, residual, relative in rows:
-        kernel = np.diag(relative) + ratio * features @ features.T
-        for o in range(OBS):
-            covariance = noise[o] * kernel
-            quadratic = residual[:, o] @ np.linalg.solve(covariance, residual[:, o])
-            total -= 0.5 * (quadratic + np.linalg.slogdet(2 * np.pi * covariance)[1])
-    assert evidence.log_likelihood(ratio) == pytest.approx(total, rel=1e-9)
+def test_the_noise_is_the_most_likely_one_of_jointly_gaussian_residuals():
+    """Its σ² is the mean of rᵀK⁻¹r over all transitions, K = I + ρΦΦᵀ."""
+    rows = episodes(2.0, np.array([0.1, 0.3]), count=3)
+    wanted = 0.0
+    for features, residual in rows:
+        kernel = np.eye(STEPS) + 3.0 * features @ features.T
+        wanted += (residual * np.linalg.solve(kernel, residual)).sum(0) / (3 * STEPS)
+    np.testing.assert_allclose(Evidence.of(rows).noise(3.0), wanted, rtol=1e-9)
 
 
-@pytest.mark.parametrize("ratio", [0.01, 1.0, 300.0])
-def test_it_finds_the_prior_that_made_the_data(ratio):
-    noise_std = np.array([0.1, 0.3])
-    evidence = Evidence.of(episodes(ratio, noise_std, count=60))
-    found = evidence.best_ratio()
-    assert ratio / 2 < found < ratio * 2
-    np.testing.assert_allclose(np.sqrt(evidence.noise(found)), noise_std, rtol=0.1)
-
-
-@pytest.mark.parametrize("criterion", ["likelihood", "foresight"])
-def test_it_is_fitted_per_member_and_ignores_the_labels_of_physics(criterion):
+def test_it_is_fitted_per_member_and_ignores_the_labels_of_physics():
     trajectories = [toys.random_trajectory(12 + n, seed=n) for n in range(3)]
     model, statistics = toys.small_model(), toys.odd_statistics()
-    planner = PlannerConfig(adaptation_criterion=criterion)
-    settings = {"history_length": 3, "planner": planner}
+    settings = {"history_length": 3, "horizon": 30}
     found = fit_prior(model, toys.POINT, statistics, trajectories, **settings)
     assert found.ratio.shape == (2,)
     assert found.noise.shape == (2, 2)
     assert (np.asarray(found.noise) > 0).all()
     renamed = [dataclasses.replace(t, sim_params={"gain": 9.0}) for t in trajectories]
     again = fit_prior(model, toys.POINT, statistics, renamed, **settings)
-    for x, y in zip(found, again, strict=True):
+    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(x, y)
-
-
-def test_the_runner_up_leaves_more_to_learn_than_the_owner():
-    """Two heads, one of which is exactly right: only the other one's errors need correcting."""
-    model = toys.linear_model([[np.eye(2), -np.eye(2)], [-np.eye(2), np.eye(2)]])
-    trajectories = [toys.random_trajectory(20, seed=n) for n in range(3)]
-    found = {
-        rank: fit_prior(
-            model,
-            toys.POINT,
-            toys.identity_statistics(),
-            trajectories,
-            history_length=3,
-            planner=PlannerConfig(adaptation_prior=rank),
-        )
-        for rank in ("owner", "runner-up")
-    }
-    spread = {
-        rank: np.asarray(prior.ratio)[:, None] * np.asarray(prior.noise)
-        for rank, prior in found.items()
-    }
-    assert (spread["runner-up"] > 1e3 * spread["owner"]).all()
 
 
 def test_the_context_is_that_of_the_moment_after_the_transition():
@@ -126,24 +88,21 @@ def test_what_lies_ahead_is_seen_with_the_context_of_the_moment():
 
 
 def residuals(features, residual):
-    return Residuals(features, residual, np.zeros(len(features)), 0)
+    return Residuals(features, residual, 0)
 
 
 @pytest.mark.parametrize("steps", [3, 5])  # fewer than features, and more
-@pytest.mark.parametrize("reference", [None, -1.0])
-def test_errors_ahead_are_those_of_regression(steps, reference):
+def test_errors_ahead_are_those_of_regression(steps):
     rng = np.random.default_rng(0)
     features, residual = rng.normal(size=(9, 4)), rng.normal(size=(9, 2))
-    root, logvar = rng.normal(size=(4, 4)), rng.normal(size=9)
-    one = Residuals(features, residual, logvar, 0)
+    root, one = rng.normal(size=(4, 4)), residuals(features, residual)
     learned, later = one.part(slice(steps)), one.part(slice(steps, None))
-    noise = np.ones(steps) if reference is None else np.exp(logvar[:steps] - reference)
     for ratio, error in zip(
-        foresight.RATIOS, foresight.errors_ahead(learned, later, root, reference), strict=True
+        foresight.RATIOS, foresight.errors_ahead(learned, later, root), strict=True
     ):
         precision = np.linalg.inv(ratio * root @ root.T)
-        gram = (features[:steps] / noise[:, None]).T @ features[:steps] + precision
-        weight = np.linalg.solve(gram, features[:steps].T @ (residual[:steps] / noise[:, None]))
+        gram = features[:steps].T @ features[:steps] + precision
+        weight = np.linalg.solve(gram, features[:steps].T @ residual[:steps])
         left = residual[steps:] - features[steps:] @ weight
         assert error == pytest.approx(np.square(left).mean(), rel=1e-4)
 
@@ -170,19 +129,19 @@ def test_directions_that_never_vary_have_a_floor():
 
 def foreseen_best(rows, horizon=10):
     """The ratio that foresight takes for some episodes of one member."""
-    cut, known = [], [[residuals(features, residual)] for features, residual, _ in rows]
+    cut, known = [], [[residuals(features, residual)] for features, residual in rows]
     for i, [one] in enumerate(known):
         for moment in foresight.moments_of(STEPS, i):
             cut.append(([one.part(slice(moment))], [one.part(slice(moment, None))]))
     directions = foresight.directions_of(known)
-    return foresight.best([foresight.relative_errors(cut, directions, horizon, [None])])
+    return foresight.best([foresight.relative_errors(cut, directions, horizon)])
 
 
 @pytest.mark.parametrize("ratio", [0.01, 1.0, 300.0])
 def test_foresight_finds_about_the_prior_that_made_the_data(ratio):
-    rows = episodes(ratio, 0.1, count=60)
+    rows = episodes(ratio, 0.1, count=200, seed=1)
     power, found = foreseen_best(rows)
-    scale = np.mean([np.square(features).sum(-1) for features, _, _ in rows])
+    scale = np.mean([np.square(features).sum(-1) for features, _ in rows])
     assert power == 0.0
     assert ratio / 5 < found / scale < ratio * 5
 
@@ -194,8 +153,7 @@ def test_what_explains_an_episode_but_predicts_nothing_is_not_trusted():
     for _ in range(20):
         features, residual = rng.normal(size=(15, 40)), rng.normal(size=(15, OBS))
         held = (np.repeat(x, 2, axis=0) for x in (features, residual))
-        rows.append((*held, np.ones(STEPS)))
-    assert Evidence.of(rows).best_ratio() > 1e3
+        rows.append(tuple(held))
     assert foreseen_best(rows)[1] < 1.0
 
 

@@ -14,7 +14,7 @@ import toys
 from headway.models.meeting import Meeting
 from headway.planning import returns, search, shares
 from headway.planning.deadline import DeadlinePlanner
-from headway.planning.imagination import Doubt, ImaginedDynamics, Layer
+from headway.planning.imagination import ImaginedDynamics
 from headway.planning.returns import RolloutSettings, candidate_returns
 from headway.planning.search import act_in_one
 from headway.planning.shares import Question, joined, num_shares, returns_of_shares
@@ -38,11 +38,10 @@ def sharing(monkeypatch):
         {},
         {"num_candidates": 41},
         {"precision": "bfloat16"},
-        {"particle_noise": "shared", "risk_aversion": 0.5},
+        {"particle_noise": "shared"},
         {"optimizer": "icem", "num_elites": 4},
         {"optimizer": "mppi"},
         {"optimizer": "random-shooting"},
-        {"settle_tolerance": 0.08, "num_iterations": 8},
     ],
     ids=str,
 )
@@ -53,26 +52,10 @@ def test_cores_that_share_a_plan_choose_the_actions_of_one_program(settings, sha
     np.testing.assert_allclose(shared, actions(agent), atol=1e-5)
 
 
-def test_a_search_ends_when_all_environments_are_settled(sharing, monkeypatch):
-    iterations, original = [], search.returns_of_shares
-    monkeypatch.setattr(
-        search, "returns_of_shares", lambda *x: iterations.append(1) or original(*x)
-    )
-    agent = make_agent(settle_tolerance=0.08, num_iterations=8)
-    state = agent.init(3, key=jax.random.key(0))
-    _, shared = agent.act(state, OBS)
-    assert 1 < len(iterations) < 8
-    assert shared.evaluations.max() == len(iterations) * TINY.num_candidates
-    monkeypatch.setattr(shares, "LEAST", np.inf)
-    _, whole = agent.act(state, OBS)
-    np.testing.assert_array_equal(shared.evaluations, whole.evaluations)
-
-
 @pytest.mark.parametrize(
     ("cores", "budget", "settings", "kind"),
     [
-        (2, ONE_BY_ONE, {}, "doubt"),
-        (2, ONE_BY_ONE, {"particle_noise": "shared", "risk_aversion": 1.0}, "head"),
+        (2, ONE_BY_ONE, {"particle_noise": "shared"}, "head"),
         (4, returns.SHARE_BUDGET, {"particle_noise": "shared"}, "last-hidden"),
         (7, returns.SHARE_BUDGET, {}, "head"),
         (40, ONE_BY_ONE, {}, "last-hidden"),
@@ -104,12 +87,8 @@ def some_question(kind="head"):
     heads, context = jnp.asarray(rng.integers(0, 2, (3, 2, 1))), rng.normal(size=(2, 3, 3))
     place = kind if kind == "last-hidden" else "head"
     model = toys.small_model(config=dataclasses.replace(toys.SMALL, context_at=place))
-    doubt = None
-    if kind == "doubt":
-        root = Layer(rng.normal(size=(3, 2, 4, toys.SMALL.hidden_sizes[-1])), np.zeros((3, 2, 4)))
-        doubt = Doubt(*jax.tree.map(jnp.float32, (root, 0.1 * rng.uniform(size=(3, 2, 2)))))
     dynamics = ImaginedDynamics.fold(
-        model, toys.identity_statistics(), heads, jnp.asarray(context, jnp.float32), doubt=doubt
+        model, toys.identity_statistics(), heads, jnp.asarray(context, jnp.float32)
     )
     candidates = jnp.asarray(rng.uniform(-1, 1, (3, 7, 4, 2)), jnp.float32)
     return Question(dynamics, toys.POINT, jnp.asarray(OBS), candidates, jax.random.key(1))

@@ -30,8 +30,8 @@ class FittingConfig:
     through block by block, in bounded memory. The paper's data are one block."""
     precision: Precision = "float32"
     """What the networks multiply while fitting, forwards and backwards. Sums, weights and Adam are
-    always float32, and so are the first layers of the networks that predict, and the loss of
-    adaptation epochs. bfloat16 is faster where the processor multiplies it; RIA cannot use it."""
+    always float32, and so are the first layers of the networks that predict. bfloat16 is faster
+    where the processor multiplies it; RIA cannot use it."""
     learning_rate: float = 1e-3
     """Adam's step size."""
     future_length: int = 5
@@ -63,10 +63,6 @@ class FittingConfig:
     RIA does. The time of an update grows with it."""
     drop_first_anchor: bool = False
     """Whether the first anchor of every trajectory is left out (a defect of the released code)."""
-    adaptation_epochs: int = 0
-    """Passes over the data after the last iteration's fit, in which the networks also learn to be
-    adapted: features are trained for what heads predict of the rest of an episode once they have
-    learned from its beginning, as with `planner.adaptation`."""
 
     def __post_init__(self):
         problems = Problems(self)
@@ -75,7 +71,6 @@ class FittingConfig:
         problems.at_least(
             0,
             "warmup_iterations",
-            "adaptation_epochs",
             "max_rollbacks",
             "backward_weight",
             "logvar_bound_weight",

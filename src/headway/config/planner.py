@@ -8,7 +8,7 @@ from headway.config.model import Precision
 from headway.problems import Problems
 
 OptimizerName = Literal["cem", "icem", "mppi", "random-shooting"]
-HeadSelection = Literal["adaptive", "average", "random", "evidence", "evidence-sampled"]
+HeadSelection = Literal["adaptive", "average", "random"]
 Adaptation = Literal["none", "last-layer"]
 
 
@@ -31,14 +31,6 @@ class PlannerConfig:
     initial_std: float = 0.5
     """Standard deviation of the first candidates, actions being scaled to [-1, 1] (CEM, iCEM);
     of all candidates (MPPI)."""
-    warm_variance: bool = False
-    """Whether to start from the variance of the last plan, shifted by one step as its mean is
-    (CEM)."""
-    warm_min_std: float = 0.1
-    """Least standard deviation to start from with `warm_variance` (CEM)."""
-    settle_tolerance: float = 0.0
-    """A search ends early where an iteration moved the mean by less than this, root mean square
-    over the plan, actions being scaled to [-1, 1]; 0 never does (CEM)."""
     noise_beta: float = 2.0
     """Exponent of the noise's power spectrum over the horizon: 0 white, 1 pink, 2 red; smoother
     for slow systems (iCEM, MPPI)."""
@@ -56,18 +48,13 @@ class PlannerConfig:
     and candidates are compared under equal luck."""
     precision: Precision = "float32"
     """What the networks multiply while planning; sums and states are always float32."""
-    devices: Literal["local", "all"] = "local"
-    """Which devices share the candidates: those of this process, or of all processes that
-    `jax.distributed` joins, which must then all act alike, step by step."""
     head_selection: HeadSelection = "adaptive"
-    """Which head plans: the best on recent transitions, their average, or a random one; the most
-    likely one given all transitions, of which older ones count less, 37 % after `selection_length`
-    steps (`evidence`), or one drawn by each member with that probability (`evidence-sampled`)."""
+    """Which head plans: the best on recent transitions, their average, or a random one."""
     selection_length: int = 10
     """Past transitions on which heads compete (N)."""
-    selection_error: Literal["mean", "sampled", "corrected"] = "mean"
+    selection_error: Literal["mean", "sampled"] = "mean"
     """Error of the predicted mean in normalised units, or (released code) of samples in raw
-    units; or of the mean with what the head has learned in the episode (last-layer)."""
+    units."""
     selection_skips_newest: bool = False
     """Whether the newest transition is not used to select heads (released code)."""
     reward: Literal["task", "released"] = "task"
@@ -75,30 +62,9 @@ class PlannerConfig:
     adaptation: Adaptation = "none"
     """Whether heads keep learning while they act: `last-layer` corrects their means by Bayesian
     regression on the episode so far. Its prior comes from the training data."""
-    adaptation_noise: Literal["constant", "heads"] = "constant"
-    """Noise of the transitions that are learned from: the same for all, or in proportion to what
-    each head's own variance says (last-layer)."""
-    adaptation_prior: Literal["owner", "runner-up"] = "owner"
-    """Which head's residuals on the training episodes are made most likely: those of the head
-    that explains an episode best, or second best, as if it were of unseen physics (last-layer).
-    With foresight it decides the noise alone (and, with noise of the heads, what that is relative
-    to); the rest is chosen by both heads."""
-    adaptation_criterion: Literal["foresight", "likelihood"] = "foresight"
-    """What the prior is chosen by: how well the rest of a training episode is foreseen, one
-    horizon ahead, after learning from its beginning; or the likelihood of whole episodes, all
-    weights being equally uncertain (last-layer)."""
-    adaptation_variance: bool = False
-    """Whether the uncertainty of what was learned adds to the noise of imagined steps (last-layer);
-    costs one more hidden layer."""
-    forgetting: float = 0.0
-    """Share of the uncertainty before the episode that comes back at every step, so that old
-    transitions count less; 0 never forgets (last-layer)."""
     change_threshold: float = 0.0
     """Log Bayes factor for changed physics above which the corrections are dropped; 0 never does
     (last-layer)."""
-    risk_aversion: float = 0.0
-    """Candidates are ranked by the mean return minus this many standard deviations over their
-    particles."""
 
     def __post_init__(self):
         problems = Problems(self)
@@ -107,30 +73,19 @@ class PlannerConfig:
         )
         problems.at_least(1, "selection_length")
         problems.between(0.0, 1.0, "smoothing")
-        problems.between(1e-6, 10.0, "initial_std", "warm_min_std")
-        problems.at_least(0, "settle_tolerance")
+        problems.between(1e-6, 10.0, "initial_std")
         problems.between(0.0, 10.0, "noise_beta")
         problems.at_least(1, "population_decay")
         problems.between(0.0, 1.0, "kept_elite_fraction")
         problems.between(1e-6, 1e6, "temperature")
         problems.one_of("optimizer", typing.get_args(OptimizerName))
         problems.one_of("head_selection", typing.get_args(HeadSelection))
-        problems.one_of("selection_error", ("mean", "sampled", "corrected"))
+        problems.one_of("selection_error", ("mean", "sampled"))
         problems.one_of("reward", ("task", "released"))
         problems.one_of("particle_noise", ("independent", "shared"))
         problems.one_of("precision", typing.get_args(Precision))
-        problems.one_of("devices", ("local", "all"))
         problems.one_of("adaptation", typing.get_args(Adaptation))
-        problems.one_of("adaptation_noise", ("constant", "heads"))
-        problems.one_of("adaptation_prior", ("owner", "runner-up"))
-        problems.one_of("adaptation_criterion", ("likelihood", "foresight"))
-        problems.between(0.0, 0.99, "forgetting")
-        problems.at_least(0, "change_threshold", "risk_aversion")
-        problems.require(
-            self.selection_error != "corrected" or self.adaptation == "last-layer",
-            "selection_error is 'corrected' where no head learns, allowed: mean or sampled, or"
-            " adaptation last-layer",
-        )
+        problems.at_least(0, "change_threshold")
         share = {"icem": 2, "mppi": 0, "random-shooting": 0}.get(self.optimizer, 1)
         problems.require(
             share * self.num_elites <= self.num_candidates,

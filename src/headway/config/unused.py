@@ -13,10 +13,7 @@ from headway.config.planner import PlannerConfig
 from headway.config.run import Config
 
 OPTIMIZER_SETTINGS: Mapping[str, tuple[str, ...]] = {
-    "cem": (
-        "num_elites", "smoothing", "initial_std", "warm_variance", "warm_min_std",
-        "settle_tolerance",
-    ),
+    "cem": ("num_elites", "smoothing", "initial_std"),
     "icem": (
         "num_elites", "smoothing", "initial_std", "noise_beta", "population_decay",
         "kept_elite_fraction",
@@ -88,21 +85,8 @@ def _samples_futures(config: Config) -> bool:
     return config.model.kind != "recurrent"
 
 
-def _selects_by_error(config: Config) -> bool:
-    return config.planner.head_selection not in ("evidence", "evidence-sampled")
-
-
 def _adapts_last_layer(config: Config) -> bool:
     return _is_multi_headed(config) and config.planner.adaptation == "last-layer"
-
-
-def _has_prior(config: Config) -> bool:
-    trained_for = _is_multi_headed(config) and config.fitting.adaptation_epochs > 0
-    return _adapts_last_layer(config) or trained_for
-
-
-def _keeps_variance(config: Config) -> bool:
-    return config.planner.warm_variance
 
 
 def _has_env_processes(config: Config) -> bool:
@@ -123,7 +107,6 @@ _USED_WHEN: tuple[tuple[Callable[[Config], bool], tuple[str, ...]], ...] = (
             "fitting.oracle",
             "fitting.logvar_bound_weight",
             "fitting.weight_decay",
-            "fitting.adaptation_epochs",
             "fitting.precision",
             "planner.head_selection",
             "planner.selection_error",
@@ -146,17 +129,6 @@ _USED_WHEN: tuple[tuple[Callable[[Config], bool], tuple[str, ...]], ...] = (
     (_adapts_by_gradient, ("model.adaptation_length", "model.adaptation_rate")),
     (_is_recurrent, ("fitting.backprop_steps",)),
     (_samples_futures, ("fitting.future_length",)),
-    (_selects_by_error, ("planner.selection_error", "planner.selection_skips_newest")),
-    (_has_prior, ("planner.adaptation_prior", "planner.adaptation_criterion")),
-    (
-        _adapts_last_layer,
-        (
-            "planner.adaptation_noise",
-            "planner.adaptation_variance",
-            "planner.forgetting",
-            "planner.change_threshold",
-        ),
-    ),
-    (_keeps_variance, ("planner.warm_min_std",)),
+    (_adapts_last_layer, ("planner.change_threshold",)),
     (_has_env_processes, ("collection.step_timeout_s",)),
 )

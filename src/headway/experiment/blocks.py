@@ -26,7 +26,6 @@ from headway.data import Episodes, Samples, Trajectory
 from headway.experiment.methods import told_sim_params
 from headway.models.dynamics import Statistics
 from headway.models.fitting import (
-    ExtraLoss,
     FitData,
     FitSetup,
     FitState,
@@ -179,7 +178,6 @@ def fit_blocks(
     blocks: Iterable[Block],
     *,
     independent: bool,
-    extra: ExtraLoss | None = None,
 ) -> tuple[FitState, EpochStats]:
     """Fit one block after the other.
 
@@ -188,14 +186,13 @@ def fit_blocks(
         setup: Task and settings.
         blocks: Those of one epoch.
         independent: Train every head on all samples.
-        extra: Another term of what is minimised.
 
     Returns:
         The new state, and averages over all updates.
     """
 
     def fit(state: FitState, data: FitData, key: PRNGKeyArray) -> tuple[FitState, EpochStats]:
-        return fit_epoch(state, setup, data, independent=independent, key=key, extra=extra)
+        return fit_epoch(state, setup, data, independent=independent, key=key)
 
     return fit_each(state, blocks, fit)
 

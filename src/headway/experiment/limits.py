@@ -140,7 +140,6 @@ def _batch(config: Config, task: Task, episode_length: int) -> int:
     widths = 3 * (sum(model.hidden_sizes) + sum(model.context_hidden_sizes)) + heads
     nets = 2 if model.backward_net else 1
     rows = config.fitting.batch_size
-    rows += episode_length if config.fitting.adaptation_epochs else 0
     of_batch = nets * model.num_members * rows * widths
     return FLOAT * (of_batch + _relation(config, task))
 

@@ -18,7 +18,7 @@ from scipy import stats
 from headway.data import Trajectory, sim_params_row
 from headway.planning.agent import Agent, choose_heads, encode
 from headway.planning.heads import RecentTransitions
-from headway.planning.last_layer.learning import Learned, correction_variance, learn
+from headway.planning.last_layer.learning import Learned, learn
 from headway.planning.last_layer.regression import Seen, foresee
 
 LEVELS = (0.5, 0.9, 0.95)  # central intervals that are counted
@@ -157,7 +157,7 @@ def _predict(
     context = encode(agent, recent, sim_params)
     transition = obs[:-1], action, obs[1:]
     seen = Seen.through(agent.model, agent.task, agent.statistics, transition, context)
-    chosen, foreseen, doubted = _live(agent, recent, context, seen, key)
+    chosen, foreseen = _live(agent, recent, context, seen, key)
     difference = seen.residual - foreseen
     errors = jnp.square(difference).mean(-1)
     if seen.logvar is None:
@@ -166,7 +166,7 @@ def _predict(
     def of_chosen(values: Float[Array, "time member head obs"]) -> Float[Array, "time member obs"]:
         return jnp.take_along_axis(values, chosen[:, :, None, None], axis=2)[:, :, 0]
 
-    std = jnp.sqrt(jnp.exp(of_chosen(seen.logvar)) + doubted)
+    std = jnp.exp(0.5 * of_chosen(seen.logvar))
     return errors, chosen, of_chosen(difference) / std
 
 
@@ -179,7 +179,6 @@ def _live(
 ) -> tuple[
     Int[Array, "time member"],
     Float[Array, "time member head obs"],
-    Float[Array, "time member obs"],
 ]:
     """Go through an episode as the agent does: learn from each step, then select.
 
@@ -191,25 +190,21 @@ def _live(
         key: Draws of a selection that is random or sampled.
 
     Returns:
-        The selected heads, how much the heads' corrections add to what they predict, and to the
-        variance that plans know of the selected one; 0 for heads that do not learn.
+        The selected heads, and how much the heads' corrections add to what they predict; 0 for
+        heads that do not learn.
     """
-    steps, planner, prior = jnp.arange(len(recent.count)), agent.planner, agent.prior
+    steps = jnp.arange(len(recent.count))
 
     def step(learned: Learned, time: Int[Array, ""]):
         now, known = jax.tree.map(lambda x: x[time][None], (recent, seen))
         told = None if context is None else context[:, time][:, None]
         learned = learn(agent, learned, now, told, time[None] > 0)
         head_key, error_key = jax.random.split(jax.random.fold_in(key, time))
-        heads = choose_heads(
-            agent, now, told, error_key=error_key, head_key=head_key, learned=learned
-        )
-        added, var = jnp.zeros_like(known.residual), jnp.zeros_like(known.residual[:, :, 0])
+        heads = choose_heads(agent, now, told, error_key=error_key, head_key=head_key)
+        added = jnp.zeros_like(known.residual)
         if learned.layer is not None:
             added = foresee(learned.layer, known.features)
-            if planner.adaptation_variance and prior is not None:
-                var = correction_variance(learned.layer, prior, heads, known.features)
-        return learned, (heads[0], added[0], var[0])
+        return learned, (heads[0], added[0])
 
     return jax.lax.scan(step, Learned.nothing(agent, 1), steps)[1]
 

@@ -136,7 +136,7 @@ class Trainer:
         num_tests = len(self.groups(iteration)) * config.evaluation.num_episodes
         learning = {
             "collect": config.collection.num_episodes * length,
-            "fit": self.learner.num_epochs(iteration),
+            "fit": self.config.fitting.epochs,
         }
         return {**(learning if self.learner.learns else {}), "evaluate": num_tests * length}
 

@@ -23,7 +23,7 @@ from headway.errors import ConfigError
 from headway.experiment.rollouts import Arena
 from headway.planning.acting import Decision, Physics
 from headway.planning.controller import env_action
-from headway.planning.devices import Devices, brought_to_each, whole_on_each
+from headway.planning.devices import brought_to_each, whole_on_each
 from headway.planning.imagination import over_rows
 from headway.planning.optimizers import Plan, SearchState, make_optimizer
 from headway.planning.step import scoring
@@ -117,7 +117,6 @@ class ClassicSimulator:
     def __init__(self, vector: ClassicVectorEnv, task: Task, planner: PlannerConfig):
         self.task = task
         self._vector = vector
-        self._devices: Devices = planner.devices
         self._plan = jax.jit(functools.partial(_plan, vector.world, task, planner))
 
     def plan(self, search: SearchState, key: PRNGKeyArray) -> Plan:
@@ -127,7 +126,7 @@ class ClassicSimulator:
             name: jnp.asarray(values, jnp.float32)
             for name, values in self._vector.sim_params.items()
         }
-        search, key = brought_to_each((search, key), self._devices)
+        search, key = brought_to_each((search, key))
         return self._plan(states, sim_params, search, key)
 
 
@@ -144,7 +143,7 @@ def _plan(
     obs = world.observe(states, jnp)
     score = scoring(task, planner, dynamics, obs)
     plan = make_optimizer(planner).optimize(score, search, key=key)
-    return whole_on_each(plan, planner.devices)
+    return whole_on_each(plan)
 
 
 class ClassicDynamics(eqx.Module):

@@ -5,7 +5,6 @@ whole data set, then forward and backward losses are minimised in mini-batches.
 """
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -63,10 +62,6 @@ class FitData(NamedTuple):
     samples: Samples
     rows: Int[Array, "member sample"]
     statistics: Statistics
-
-
-ExtraLoss = Callable[[MultiHeadDynamics, FitData, PRNGKeyArray], Float[Array, ""]]
-"""Another term of what is minimised; a pytree that draws what it looks at with the key."""
 
 
 class FitSetup(eqx.Module):
@@ -251,7 +246,6 @@ def update(
     data: FitData,
     batch: Batch,
     owners: Assignment | None,
-    extra: Callable[[MultiHeadDynamics], Float[Array, ""]] | None = None,
 ) -> tuple[FitState, tuple[Float[Array, ""], Float[Array, ""], Bool[Array, ""]]]:
     """Take one Adam step; a step with a non-finite loss or gradient is skipped."""
 
@@ -259,8 +253,6 @@ def update(
         reduced = model.in_precision(setup.config.precision)
         losses = head_losses(reduced, setup.task, data.statistics, batch)
         loss, forward = total_loss(model, losses, owners, batch.weight, setup.config)
-        if extra is not None:
-            loss = loss + extra(model)
         if model.relation_head is None:
             return loss, (forward, None)
         pull, similar = intervene(model, setup.task, data.statistics, batch, setup.config)
@@ -279,15 +271,6 @@ def update(
     return state, (jnp.where(skipped, 0.0, loss), jnp.where(skipped, 0.0, forward), skipped)
 
 
-def of_update(
-    extra: ExtraLoss | None, data: FitData, key: PRNGKeyArray, number: Int[Array, ""]
-) -> Callable[[MultiHeadDynamics], Float[Array, ""]] | None:
-    """What an extra term, if there is one, asks of the model in one update."""
-    if extra is None:
-        return None
-    return lambda model: extra(model, data, jax.random.fold_in(key, number))
-
-
 def one_epoch(
     state: FitState,
     setup: FitSetup,
@@ -295,7 +278,6 @@ def one_epoch(
     *,
     independent: bool,
     key: PRNGKeyArray,
-    extra: ExtraLoss | None = None,
 ) -> tuple[FitState, EpochStats]:
     """Assign heads, shuffle per member, and go once through the data.
 
@@ -305,7 +287,6 @@ def one_epoch(
         data: The data set, with its normalisers.
         independent: Train every head on all samples (warm-up, or `oracle="independent"`).
         key: Shuffles the samples.
-        extra: Another term of what is minimised, with a key of its own for every update.
     """
     assignment = None
     if not independent:
@@ -321,8 +302,7 @@ def one_epoch(
             (i * size + jnp.arange(size) < data.samples.count).astype(jnp.float32), chunk.shape
         )
         batch, owners = gather_batch(data, assignment, chunk, weight, setup)
-        more = of_update(extra, data, key, i)
-        state, (one_loss, one_forward, bad) = update(state, setup, data, batch, owners, more)
+        state, (one_loss, one_forward, bad) = update(state, setup, data, batch, owners)
         return state, loss + one_loss, forward + one_forward, skipped + bad
 
     zero = jnp.zeros(())

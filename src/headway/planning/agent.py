@@ -16,14 +16,7 @@ from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.planning.acting import Decision
 from headway.planning.heads import RecentTransitions, head_errors, select_heads
 from headway.planning.imagination import ImaginedDynamics
-from headway.planning.last_layer.learning import (
-    Learned,
-    by_evidence,
-    corrected_errors,
-    doubt,
-    heads_by_evidence,
-    learn,
-)
+from headway.planning.last_layer.learning import Learned, learn
 from headway.planning.last_layer.regression import Prior
 from headway.planning.optimizers import Plan, SearchState, make_optimizer, where_env
 from headway.planning.search import act
@@ -123,9 +116,7 @@ class Agent(eqx.Module):
         # 3. Learn from that transition, where anything keeps learning.
         learned = learn(self, state.learned, recent, context, state.acted)
         # 4. Choose the head that best explains the recent past.
-        heads = choose_heads(
-            self, recent, context, error_key=error_key, head_key=head_key, learned=learned
-        )
+        heads = choose_heads(self, recent, context, error_key=error_key, head_key=head_key)
         chosen, layer = planning_heads(self, heads), learned.layer
         dynamics = ImaginedDynamics.fold(
             self.model,
@@ -134,7 +125,6 @@ class Agent(eqx.Module):
             context,
             precision=self.planner.precision,
             correction=None if layer is None else layer.weight,
-            doubt=None if layer is None else doubt(self, layer, chosen, context),
         )
         return Prepared(recent, learned, heads, dynamics, key, plan_key)
 
@@ -182,20 +172,11 @@ def choose_heads(
     *,
     error_key: PRNGKeyArray,
     head_key: PRNGKeyArray,
-    learned: Learned | None = None,
 ) -> Int[Array, "env member"]:
-    """One head per environment and member, by its error on the recent transitions.
-
-    With what was `learned` in the episode, also by the evidence for it.
-    """
-    layer, log_evidence = (None, None) if learned is None else learned[:2]
-    if log_evidence is not None and by_evidence(agent):
-        return heads_by_evidence(agent, log_evidence, key=head_key)
+    """One head per environment and member, by its error on the recent transitions."""
     slots, used = recent.newest(agent.planner)
     if agent.planner.head_selection == "random":
         used = jnp.zeros_like(used)
-    if layer is not None and agent.planner.selection_error == "corrected":
-        return select_heads(corrected_errors(agent, layer, slots, context), used, key=head_key)
     sampling_key = error_key if agent.planner.selection_error == "sampled" else None
     errors = head_errors(
         agent.model, agent.task, agent.statistics, slots, context, sampling_key=sampling_key

@@ -257,7 +257,7 @@ class Controller:
         """The next action of the last plan."""
         self._count(True, reason)
         planner: Any = self._planner  # there is a plan to hold to
-        self._state = _held(planner, brought_to_each(self._state, planner.devices))
+        self._state = _held(planner, brought_to_each(self._state))
         scaled = jax.device_get(self._state.action[0])
         self._status = Status("held", reason, (), 0, time.perf_counter() - started)
         return env_action(self.agent.task, scaled)

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from headway.errors import ConfigError
 from headway.planning.acting import Decision
 from headway.planning.optimizers import make_optimizer
 from headway.planning.search import begin, end, iterate
@@ -44,20 +43,11 @@ class DeadlinePlanner:
         agent: The trained agent.
         seconds: From the start of a step to its decision.
         clock: Tells the seconds.
-
-    Raises:
-        ConfigError: The agent shares its plans with other processes, which would have to stop
-            at the same iteration.
     """
 
     def __init__(
         self, agent: Planning, seconds: float, clock: Callable[[], float] = time.perf_counter
     ):
-        if agent.planner.devices != "local":
-            raise ConfigError(
-                f"planner.devices is {agent.planner.devices!r}, allowed with a deadline: 'local';"
-                " change it, or plan without a deadline."
-            )
         self._agent, self._seconds, self._clock = agent, seconds, clock
         self._optimizer = make_optimizer(agent.planner)
         self._parts: dict[str, Callable] = {"begin": begin, "iterate": iterate, "end": end}
@@ -91,17 +81,16 @@ class DeadlinePlanner:
         """
         until = started + self._seconds
         begun, search = self._timed("begin", state, jnp.asarray(obs))
-        done, settled = 0, False
-        while done < self._optimizer.num_iterations and not settled:
+        done = 0
+        while done < self._optimizer.num_iterations:
             if done >= at_least and not self._fits(until):
                 break
-            search, settled = self._timed("iterate", begun, search, done)
-            settled = bool(settled.all())
+            search = self._timed("iterate", begun, search, done)
             done += 1
         if done == 0:
             self._forget_slowest()
         state, decision = self._timed("end", state, begun, search)
-        complete = settled or done == self._optimizer.num_iterations
+        complete = done == self._optimizer.num_iterations
         return Outcome(state, decision, done, complete)
 
     def _fits(self, until: float) -> bool:

@@ -3,7 +3,7 @@
 Decided when a plan is compiled. None of it changes a result beyond rounding.
 """
 
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -13,7 +13,6 @@ from jaxtyping import Array
 from headway.models.meeting import seeds_at_once
 
 Tree = TypeVar("Tree")
-Devices = Literal["local", "all"]
 
 CPU_BUDGET = 4 * 2**20
 """Bytes that one array of activations may take on a CPU: more would leave its caches."""
@@ -46,38 +45,33 @@ def activation_budget() -> int:
     return sum(memory_budget(device.platform, device.memory_stats()) for device in devices)
 
 
-def spread_candidates(x: Array, devices: Devices = "local") -> Array:
-    """Share the last axis, the candidates, among devices.
-
-    Args:
-        x: Any array whose last axis is the candidates.
-        devices: Those of this process, or of all processes together.
-    """
-    mesh = _mesh(devices)
+def spread_candidates(x: Array) -> Array:
+    """Share the last axis, the candidates, among the local devices."""
+    mesh = _mesh()
     if mesh.size == 1:
         return x
     spec = PartitionSpec(*[PartitionSpec.UNCONSTRAINED] * (x.ndim - 1), "candidate")
     return jax.lax.with_sharding_constraint(x, NamedSharding(mesh, spec))
 
 
-def whole_on_each(tree: Tree, devices: Devices) -> Tree:
+def whole_on_each(tree: Tree) -> Tree:
     """Give every device all of some arrays that a compiled step returns.
 
-    So each process can read them, and they can be the next step's arguments as they are.
+    So they can be the next step's arguments as they are.
     """
-    everywhere = _everywhere(devices)
+    everywhere = _everywhere()
     if everywhere.mesh.size == 1:
         return tree
     return jax.lax.with_sharding_constraint(tree, everywhere)
 
 
-def brought_to_each(tree: Tree, devices: Devices) -> Tree:
+def brought_to_each(tree: Tree) -> Tree:
     """What a compiled step remembers, where `whole_on_each` leaves it, also before the first step.
 
     So the second step does not have to be compiled again for arrays that lie elsewhere.
     """
-    everywhere = _everywhere(devices)
-    if everywhere.mesh.size == 1 or devices != "local":
+    everywhere = _everywhere()
+    if everywhere.mesh.size == 1:
         return tree
     return jax.tree.map(
         lambda x: (
@@ -87,13 +81,12 @@ def brought_to_each(tree: Tree, devices: Devices) -> Tree:
     )
 
 
-def _everywhere(devices: Devices) -> NamedSharding:
-    return NamedSharding(_mesh(devices), PartitionSpec())
+def _everywhere() -> NamedSharding:
+    return NamedSharding(_mesh(), PartitionSpec())
 
 
-def _mesh(devices: Devices) -> Mesh:
-    found = jax.devices() if devices == "all" else jax.local_devices()
-    return Mesh(np.array(found), ("candidate",))
+def _mesh() -> Mesh:
+    return Mesh(np.array(jax.local_devices()), ("candidate",))
 
 
 def memory_budget(platform: str, stats: dict[str, int] | None) -> int:

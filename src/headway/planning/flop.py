@@ -3,7 +3,6 @@
 import itertools
 
 from headway.config import ModelConfig, PlannerConfig
-from headway.models.dynamics import context_size
 from headway.planning.optimizers import make_optimizer
 from headway.tasks.base import Task
 
@@ -43,8 +42,4 @@ def step_flop(model: ModelConfig, planner: PlannerConfig, task: Task) -> float:
     if model.kind == "recurrent":
         products = [4 * (n + m) * m for n, m in itertools.pairwise(sizes)]
     total = sum(products) + sizes[-1] * outputs * task.obs_size
-    if planner.adaptation != "none" and planner.adaptation_variance:
-        context = context_size(model, task, 0)  # without the few simulator parameters of some
-        features = sizes[-1] + 1 + (context if model.context_at == "head" else 0)
-        total += sizes[-1] * features
     return float(2 * total)

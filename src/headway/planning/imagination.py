@@ -66,23 +66,6 @@ class ChosenHeads(NamedTuple):
     max_logvar: Float[Array, "*env member choice obs"] | None
     context_bias: Float[Array, "*env member out"] | None = None
     """Bias of the hidden layer that the context joins; None if it joins the heads."""
-    doubt: "Doubt | None" = None
-
-
-class Doubt(NamedTuple):
-    """How uncertain the chosen heads' corrections are."""
-
-    root: Layer
-    """Sᵀ as a layer: its squared output sums to the variance φᵀPφ of `last_layer.regression`."""
-    scale: Float[Array, "*env member obs"]
-    """Standard deviation of the noise that it multiplies, in raw units."""
-
-    def var(
-        self, hidden: Float[Array, "member hidden particle candidate"]
-    ) -> Float[Array, "member obs particle candidate"]:
-        """Variance of the delta that stems from the correction, in raw units."""
-        total = jnp.square(self.root(hidden)).sum(1, keepdims=True)
-        return total * jnp.square(self.scale)[:, :, None, None]
 
 
 class ImaginedDynamics(eqx.Module):
@@ -111,7 +94,6 @@ class ImaginedDynamics(eqx.Module):
         *,
         precision: str = "float32",
         correction: Correction | None = None,
-        doubt: "Doubt | None" = None,
     ) -> "ImaginedDynamics":
         """Fold a model for one plan.
 
@@ -123,7 +105,6 @@ class ImaginedDynamics(eqx.Module):
             precision: Of the products' inputs, `float32` or `bfloat16`. The first layer stays
                 in float32: it takes raw observations, whose offsets bfloat16 would not resolve.
             correction: Added to the weights of the mean heads, the last row to their biases.
-            doubt: How uncertain the correction is, if plans are to know it.
         """
         net = model.forward_net
         dtype = PRECISIONS[precision]
@@ -146,7 +127,7 @@ class ImaginedDynamics(eqx.Module):
             low, high = net.min_logvar[heads], net.max_logvar[heads]
         weight = jnp.concatenate(weights, axis=-1).mT.astype(dtype)
         output = Layer(weight, jnp.concatenate(biases, axis=-1))
-        own = ChosenHeads(output, low, high, context_bias, doubt)
+        own = ChosenHeads(output, low, high, context_bias)
         return cls(hidden, own, delta.std, place)
 
     @property
@@ -182,7 +163,7 @@ class ImaginedDynamics(eqx.Module):
     @property
     def stochastic(self) -> bool:
         """Whether deltas have a variance."""
-        return self.heads.min_logvar is not None or self.heads.doubt is not None
+        return self.heads.min_logvar is not None
 
     def start(self) -> tuple[()]:
         """See `Dynamics.start`; nothing is carried from step to step."""
@@ -217,15 +198,10 @@ class ImaginedDynamics(eqx.Module):
         out = self.heads.layer(x)
         obs_size = self.delta_std.shape[0]
         mean = out[:, :obs_size]
-        low, high, doubt = self.heads.min_logvar, self.heads.max_logvar, self.heads.doubt
-        if noise is None:
+        low, high = self.heads.min_logvar, self.heads.max_logvar
+        if noise is None or low is None or high is None:
             return mean
-        std = jnp.zeros(())
-        if low is not None and high is not None:
-            std = self._std(out[:, obs_size:], low, high)
-        if doubt is not None:
-            std = jnp.sqrt(jnp.square(std) + doubt.var(x))
-        return mean + noise * std
+        return mean + noise * self._std(out[:, obs_size:], low, high)
 
     def _std(
         self,

@@ -9,12 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from headway.config import PlannerConfig
-from headway.planning.devices import (
-    SHARE_BUDGET,
-    Devices,
-    environments_at_once,
-    spread_candidates,
-)
+from headway.planning.devices import SHARE_BUDGET, environments_at_once, spread_candidates
 from headway.planning.imagination import over_rows
 from headway.planning.noise import normal_block
 from headway.tasks.base import Task
@@ -29,10 +24,6 @@ class RolloutSettings:
     """Whether all candidates of a step share the noise of their particles."""
     released_reward: bool = False
     """Whether to plan with the released code's reward."""
-    risk_aversion: float = 0.0
-    """Standard deviations over the particles that are taken off the mean return."""
-    devices: Devices = "local"
-    """Which devices share the candidates."""
 
     @classmethod
     def of(cls, planner: PlannerConfig, num_members: int) -> "RolloutSettings":
@@ -41,8 +32,6 @@ class RolloutSettings:
             planner.num_particles // num_members,
             planner.particle_noise == "shared",
             planner.reward == "released",
-            planner.risk_aversion,
-            planner.devices,
         )
 
 
@@ -224,10 +213,7 @@ class _Rollouts(NamedTuple):
             total = jax.lax.map(lambda i: self._totals(dynamics.of_member(i), i)[0], members)
         else:
             total = self._totals(dynamics, jnp.zeros((), jnp.int32))
-        mean = total.mean((0, 1))
-        if not self.settings.risk_aversion:
-            return mean
-        return mean - self.settings.risk_aversion * total.std((0, 1))
+        return total.mean((0, 1))
 
     def _totals(
         self, dynamics: Dynamics, member: Int[Array, ""]
@@ -236,7 +222,7 @@ class _Rollouts(NamedTuple):
         num_candidates, _, action_size = self.candidates.shape
         members, particles = dynamics.num_members, self.settings.particles_per_member
         rows = members, particles, num_candidates
-        task, spread = self.task, self._spread
+        task, spread = self.task, spread_candidates
         reward_of = task.released_reward if self.settings.released_reward else task.reward
         reward_of, terminated = over_rows(reward_of), over_rows(task.terminated)
         scale_action = over_rows(task.scale_action)
@@ -297,7 +283,4 @@ class _Rollouts(NamedTuple):
         particles = self.settings.particles_per_member
         whole = self.dynamics.num_members, obs_size, particles, total
         start, size = (member, 0, 0, first), (members, obs_size, particles, here)
-        return self._spread(normal_block(key, whole, start, size))
-
-    def _spread(self, x: Array) -> Array:
-        return spread_candidates(x, self.settings.devices)
+        return spread_candidates(normal_block(key, whole, start, size))

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.models.compilation import in_each_precision
 from headway.planning.acting import Decision
@@ -32,7 +32,7 @@ def act(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[Any,
     """One whole step."""
     if num_shares(agent.planner, len(obs)) > 1 and not _traced((agent, state, obs)):
         return _act_by_iteration(agent, state, obs)
-    state = brought_to_each(state, agent.planner.devices)
+    state = brought_to_each(state)
     return _compiled(agent, "act")(agent, state, obs)
 
 
@@ -42,22 +42,18 @@ def _act_by_iteration(
     planner = agent.planner
     begun, search = begin(agent, state, obs)
     for iteration in range(planner.num_iterations):
-        search, settled = iterate(agent, begun, search, iteration)
-        if planner.settle_tolerance and settled.all():
-            break
+        search = iterate(agent, begun, search, iteration)
     return end(agent, state, begun, search)
 
 
 def begin(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[Begun, Any]:
     """All of a step that comes before its first iteration, and the search as it is then."""
-    state = brought_to_each(state, agent.planner.devices)
+    state = brought_to_each(state)
     return _compiled(agent, "begin")(agent, state, obs)
 
 
-def iterate(
-    agent: Planning, begun: Begun, search: Any, iteration: int
-) -> tuple[Any, Bool[Array, " env"]]:
-    """The search after another iteration, and where it needs no further one."""
+def iterate(agent: Planning, begun: Begun, search: Any, iteration: int) -> Any:
+    """The search after another iteration."""
     planner, optimizer = agent.planner, make_optimizer(agent.planner)
     kind, key = optimizer.kind(iteration), begun.keys[iteration]
     shares = num_shares(planner, len(begun.obs))
@@ -81,7 +77,7 @@ def act_in_one(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tup
     score = scoring(agent.task, agent.planner, prepared.dynamics, obs)
     optimizer = make_optimizer(agent.planner)
     plan = optimizer.optimize(score, state.search, key=prepared.plan_key)
-    return whole_on_each(agent.decide(state, obs, prepared, plan), agent.planner.devices)
+    return whole_on_each(agent.decide(state, obs, prepared, plan))
 
 
 def _begin(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[Begun, Any]:
@@ -89,16 +85,14 @@ def _begin(agent: Planning, state: Any, obs: Float[Array, "env obs"]) -> tuple[B
     optimizer = make_optimizer(agent.planner)
     keys = jax.random.split(prepared.plan_key, optimizer.num_iterations)
     begun = Begun(prepared, obs, list(keys)), optimizer.begin(state.search)
-    return whole_on_each(begun, agent.planner.devices)
+    return whole_on_each(begun)
 
 
-def _iterate(
-    agent: Planning, begun: Begun, search: Any, key: PRNGKeyArray, iteration: int
-) -> tuple[Any, Bool[Array, " env"]]:
+def _iterate(agent: Planning, begun: Begun, search: Any, key: PRNGKeyArray, iteration: int) -> Any:
     optimizer = make_optimizer(agent.planner)
     score = scoring(agent.task, agent.planner, begun.prepared.dynamics, begun.obs)
     search = optimizer.iterate(score, search, key, iteration)
-    return whole_on_each((search, optimizer.settled(search)), agent.planner.devices)
+    return whole_on_each(search)
 
 
 def _ask(
@@ -114,15 +108,14 @@ def _tell(
     search: Any,
     candidates: Float[Array, "env candidate horizon action"],
     returns: list[Float[Array, "env share"]],
-) -> tuple[Any, Bool[Array, " env"]]:
-    search = optimizer.tell(search, candidates, joined(returns, candidates.shape[1]))
-    return search, optimizer.settled(search)
+) -> Any:
+    return optimizer.tell(search, candidates, joined(returns, candidates.shape[1]))
 
 
 def _end(agent: Planning, state: Any, begun: Begun, search: Any) -> tuple[Any, Decision]:
     plan = make_optimizer(agent.planner).end(search)
     decided = agent.decide(state, begun.obs, begun.prepared, plan)
-    return whole_on_each(decided, agent.planner.devices)
+    return whole_on_each(decided)
 
 
 _PARTS = {

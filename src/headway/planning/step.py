@@ -84,4 +84,4 @@ def hold(planner: PlannerConfig, state: Any) -> Any:
     search = make_optimizer(planner).shift(state.search)
     unseen = jnp.zeros_like(state.acted)
     held = state._replace(action=state.search.guess[:, 0], acted=unseen, search=search)
-    return whole_on_each(held, planner.devices)
+    return whole_on_each(held)

@@ -101,9 +101,6 @@ def run_flop(config: Config, first_iteration: int = 0) -> float:
         steps += groups * config.evaluation.num_episodes * length
         samples = (iteration + 1) * collected * config.fitting.future_length
         passes = config.fitting.epochs
-        if last and config.model.kind == "multi-headed":
-            # Every update also looks at an episode.
-            passes += config.fitting.adaptation_epochs * (1 + length / config.fitting.batch_size)
         total += steps * per_step + passes * samples * per_sample
     return total
 

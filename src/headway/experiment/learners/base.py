@@ -62,11 +62,6 @@ class Learner(abc.ABC):
     def fit(self, trajectories: list[Trajectory], iteration: int, key: PRNGKeyArray) -> Fit:
         """Prepare to fit everything collected so far; the key alone decides what is drawn."""
 
-    def num_epochs(self, iteration: int) -> int:
-        """Passes over the data in an iteration's fit."""
-        del iteration
-        return self.config.fitting.epochs
-
     @abc.abstractmethod
     def agent(
         self,

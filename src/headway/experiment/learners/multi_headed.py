@@ -10,20 +10,16 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from headway.config import PlannerConfig
 from headway.data import Episodes, Trajectory
-from headway.experiment.blocks import Block, BlockedData, Layout, fit_blocks
+from headway.experiment.blocks import BlockedData, Layout, fit_blocks
 from headway.experiment.diagnostics import head_shares, prediction_error
 from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
 from headway.experiment.methods import told_sim_params
 from headway.experiment.rollouts import Arena
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitSetup, FitState, episode_losses
-from headway.models.updates import EpochStats
 from headway.planning.agent import Agent
 from headway.planning.last_layer.prior import fit_prior
-from headway.planning.last_layer.regression import Prior
-from headway.planning.last_layer.training import AdaptationLoss, for_adaptation
 
 
 class MultiHeaded(Learner):
@@ -61,42 +57,14 @@ class MultiHeaded(Learner):
             or model.num_heads == 1
         )
 
-        def go_through(
-            blocks: Iterable[Block], state: FitState, epoch: int
-        ) -> tuple[FitState, EpochStats]:
-            if epoch < fitting.epochs:
-                return fit_blocks(state, self.setup, blocks, independent=independent)
-            setup = for_adaptation(self.setup)
-            if epoch == fitting.epochs:
-                state = setup.init(state.model)  # Adam begins anew: it minimises something else
-            loss = self.adaptation_loss(Learned(state, statistics), trajectories)
-            return fit_blocks(state, setup, blocks, independent=independent, extra=loss)
-
         def epochs(state: FitState, first: int) -> Epochs:
-            last = self.num_epochs(iteration)
-            with closing(data.stream(last, epoch_key, first=first)) as blocks:
-                for epoch in range(first, last):
+            with closing(data.stream(fitting.epochs, epoch_key, first=first)) as blocks:
+                for _ in range(first, fitting.epochs):
                     of_epoch = itertools.islice(blocks, data.num_blocks)
-                    state, stats = go_through(of_epoch, state, epoch)
+                    state, stats = fit_blocks(state, self.setup, of_epoch, independent=independent)
                     yield state, stats
 
         return Fit(statistics, epochs)
-
-    def num_epochs(self, iteration: int) -> int:
-        """See `Learner.num_epochs`."""
-        last = iteration == self.config.collection.num_iterations - 1
-        return self.config.fitting.epochs + last * self.config.fitting.adaptation_epochs
-
-    def adaptation_loss(
-        self, learned: Learned, trajectories: Sequence[Trajectory]
-    ) -> AdaptationLoss:
-        """The loss after learning, from the prior that an agent would get at the moment.
-
-        The noise of a task is constant in it, whatever `planner.adaptation_noise` says.
-        """
-        planner = dataclasses.replace(self.config.planner, adaptation_noise="constant")
-        prior = self._prior(learned, trajectories, planner)
-        return AdaptationLoss(self.task, self.config.model.history_length, prior)
 
     def agent(
         self,
@@ -110,20 +78,15 @@ class MultiHeaded(Learner):
         planner, history_length = self.config.planner, self.config.model.history_length
         prior = None
         if planner.adaptation != "none":
-            prior = self._prior(learned, trajectories, planner)
+            prior = fit_prior(
+                model,
+                self.task,
+                statistics,
+                trajectories,
+                history_length=history_length,
+                horizon=planner.horizon,
+            )
         return Agent(model, statistics, self.task, planner, history_length, prior)
-
-    def _prior(
-        self, learned: Learned, trajectories: Sequence[Trajectory], planner: PlannerConfig
-    ) -> Prior:
-        return fit_prior(
-            learned.fit.model,
-            self.task,
-            learned.statistics,
-            trajectories,
-            history_length=self.config.model.history_length,
-            planner=planner,
-        )
 
     def frozen(self, learned: Learned) -> Agent:
         """The agent whose heads stay as they were fitted."""

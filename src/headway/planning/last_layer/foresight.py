@@ -90,7 +90,6 @@ def relative_errors(
     foreseen: Foreseen,
     directions: Sequence[Directions],
     horizon: int,
-    references: Sequence[float | None],
 ) -> Errors:
     """Mean squared error of what comes, over that without learning.
 
@@ -98,15 +97,13 @@ def relative_errors(
         foreseen: Through which heads, from which moments.
         directions: How the features of each member vary.
         horizon: Transitions ahead that count.
-        references: What each member's heads claim of their error on average, a log-variance, if
-            the noise is relative to it.
     """
     roots = [[one.root(power) for power in POWERS] for one in directions]
     total, frozen = np.zeros((len(POWERS), len(RATIOS))), 0.0
     for before, after in foreseen:
-        for learned, later, own, reference in zip(before, after, roots, references, strict=True):
+        for learned, later, own in zip(before, after, roots, strict=True):
             ahead = later.part(slice(horizon))
-            total += [errors_ahead(learned, ahead, root, reference) for root in own]
+            total += [errors_ahead(learned, ahead, root) for root in own]
             frozen += float(np.square(ahead.residual).mean())
     return total / max(frozen, MIN_NOISE)
 
@@ -115,14 +112,12 @@ def errors_ahead(
     learned: Residuals,
     later: Residuals,
     root: Float[np.ndarray, "feature feature"],
-    reference: float | None = None,
 ) -> Float[np.ndarray, " ratio"]:
     """Mean squared error of later transitions after learning, with each ratio of `RATIOS`.
 
     One decomposition serves all ratios: of ΦΦᵀ or of ΦᵀΦ, whichever is smaller.
     """
-    scale = learned.relative_noise(reference)[:, None] ** -0.5
-    features, target = learned.features @ root * scale, learned.residual * scale
+    features, target = learned.features @ root, learned.residual
     ahead = later.features @ root
     if len(features) > features.shape[1]:
         values, vectors = np.linalg.eigh(features.T @ features)

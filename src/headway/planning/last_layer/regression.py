@@ -6,13 +6,11 @@ the backbone's output, the context and a 1. For every environment, member, head 
     r_o = φᵀ w_o + ε,    w_o ~ N(0, σ_o² ρ R Rᵀ),    ε ~ N(0, σ_o² n),
 
 where r is the normalised delta minus the head's mean, ρ, R and σ² come from the training data
-(`prior`), and n is 1 or says how noisy the head holds this transition to be. The posterior
+(`prior`), and n is 1, or more for a transition that is doubted. The posterior
 covariance is σ_o² P, and P depends on the features only, so the dimensions share it.
 
 Every transition is one step of a Kalman filter, in closed form. The chosen head's posterior mean
-is then added to its weights before the plan, so imagined rollouts cost nothing more. With
-`forgetting` the weights follow an Ornstein-Uhlenbeck process whose stationary distribution is
-the prior: P never exceeds ρ R Rᵀ, however long an episode is.
+is then added to its weights before the plan, so imagined rollouts cost nothing more.
 
 Sources: Bayesian linear regression (Bishop, 2006, section 3.3); ALPaCA (Harrison et al., 2018);
 Potter's square-root filter (Maybeck, 1979, section 7.3).
@@ -33,8 +31,6 @@ BELIEVABLE = 100.0
 a transition that no head finds smaller teaches nothing."""
 MAX_FEATURES = 1e8
 """Squared norm of the features; larger ones teach nothing."""
-MAX_LOG_NOISE = 7.0
-"""Largest logarithm of the relative noise, either way."""
 NOISE_DOF = 1.0
 """Transitions that the training data's noise variance is worth in an episode."""
 TINY = 1e-12
@@ -57,8 +53,6 @@ class Prior(NamedTuple):
     have the same."""
     noise: Float[Array, "member obs"]
     """Variance of the noise in normalised units (σ²)."""
-    log_reference: Float[Array, " member"]
-    """Log-variance that the heads claim on average; relative noise n is measured against it."""
     shape: Shape | None = None
     """None where all weights are equally uncertain (R = I)."""
 
@@ -71,14 +65,6 @@ class Prior(NamedTuple):
         """Square root of the prior covariance in units of the noise variance, √ρ R."""
         shape = jnp.eye(size) if self.shape is None else self.shape.root
         return jnp.sqrt(self.ratio)[:, None, None] * shape
-
-    def even(
-        self, features: Float[Array, "time member feature"]
-    ) -> Float[Array, "time member feature"]:
-        """Rᵀφ: the same information in features whose weights are all equally uncertain."""
-        if self.shape is None:
-            return features
-        return jnp.einsum("tmi,mij->tmj", features, self.shape.root)
 
 
 class Seen(NamedTuple):
@@ -186,7 +172,7 @@ class Observed(NamedTuple):
     features: Float[Array, "env member feature"]
     residual: Float[Array, "env member head obs"]
     noise: Float[Array, "env member group"]
-    """Relative variance n of the noise: one for all heads, or one for each."""
+    """Relative variance n of the noise, 1 unless the transition is doubted."""
 
     @property
     def learned_from(self) -> Float[Array, "env member"]:
@@ -198,22 +184,15 @@ class Observed(NamedTuple):
         cls,
         seen: Seen,
         happened: Bool[Array, " env"],
-        log_reference: Float[Array, " member"] | None = None,
     ) -> "Observed":
         """Keep what happened and can be true (`Seen.believed`).
 
         Args:
             seen: The transitions.
             happened: Where there was one.
-            log_reference: Given if the noise follows the heads' own variance; `Prior` has it.
         """
         features, residual, _ = seen.believed(happened)
-        true = features[..., -1] > 0
-        noise = jnp.ones((*true.shape, 1))
-        if seen.logvar is not None and log_reference is not None:
-            relative = seen.logvar.mean(-1) - log_reference[:, None]
-            noise = jnp.exp(jnp.clip(relative, -MAX_LOG_NOISE, MAX_LOG_NOISE))
-        return cls(features, residual, jnp.where(true[..., None], noise, 1.0))
+        return cls(features, residual, jnp.ones((*features.shape[:-1], 1)))
 
     def noisier(self, more: Float[Array, "env member group"]) -> "Observed":
         """The same with more noise, so that it counts for less."""
@@ -234,22 +213,19 @@ class LastLayer(NamedTuple):
     """Transitions that were learned from."""
 
     @classmethod
-    def of_prior(
-        cls, prior: Prior, num_envs: int, sizes: tuple[int, int, int], *, groups: int = 1
-    ) -> "LastLayer":
+    def of_prior(cls, prior: Prior, num_envs: int, sizes: tuple[int, int, int]) -> "LastLayer":
         """Nothing learned yet.
 
         Args:
             prior: Where every episode starts.
             num_envs: How many environments.
             sizes: Heads, features (with the 1), and dimensions of an observation.
-            groups: 1 if all heads share their noise, else the number of heads.
         """
         heads, features, obs_size = sizes
         start = prior.root(features)[:, None]
         return cls(
             jnp.zeros((num_envs, prior.members, heads, features, obs_size)),
-            jnp.broadcast_to(start, (num_envs, prior.members, groups, features, features)),
+            jnp.broadcast_to(start, (num_envs, prior.members, 1, features, features)),
             jnp.zeros((num_envs, prior.members, heads, obs_size)),
             jnp.zeros((num_envs, prior.members)),
         )
@@ -299,25 +275,6 @@ def update(state: LastLayer, seen: Observed, expected: Forecast) -> LastLayer:
     learned = seen.learned_from
     squares = jnp.square(innovation) / spread[..., None] * learned[..., None, None]
     return LastLayer(weight, state.root - lost, state.squares + squares, state.count + learned)
-
-
-def forget(state: LastLayer, prior: Prior, share: float) -> LastLayer:
-    """Let the weights drift back towards the prior, as time passes.
-
-    Args:
-        state: What was learned.
-        prior: Where the weights drift.
-        share: Share of the covariance that is the prior's again after one step; above 0.
-    """
-    scale = jnp.sqrt(jnp.maximum(prior.ratio, TINY))[:, None, None, None]
-    relative = state.root / scale
-    if prior.shape is not None:
-        relative = prior.shape.inverse[:, None] @ relative
-    size = relative.shape[-1]
-    mixed = (1.0 - share) * relative @ relative.mT + share * jnp.eye(size)
-    root = prior.root(size)[:, None] @ jnp.linalg.cholesky(mixed)
-    kept = 1.0 - share
-    return LastLayer(kept**0.5 * state.weight, root, kept * state.squares, kept * state.count)
 
 
 def credence(

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float, Int
 from headway.data import Episodes, Trajectory
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.planning.last_layer.regression import (
-    MAX_LOG_NOISE,
     Seen,
     heads_by_error,
     see_episode,
@@ -27,19 +26,11 @@ class Residuals(NamedTuple):
 
     features: Float[np.ndarray, "time feature"]
     residual: Float[np.ndarray, "time obs"]
-    logvar: Float[np.ndarray, " time"]
-    """What the head claims of its error, averaged over dimensions; 0 if it claims nothing."""
     head: int
 
     def part(self, steps: slice) -> "Residuals":
         """Some of the transitions."""
-        return Residuals(self.features[steps], self.residual[steps], self.logvar[steps], self.head)
-
-    def relative_noise(self, reference: float | None) -> Float[np.ndarray, " time"]:
-        """Variance of the noise over what the heads claim on average; 1 without a reference."""
-        if reference is None:
-            return np.ones(len(self.logvar))
-        return np.exp(np.clip(self.logvar - reference, -MAX_LOG_NOISE, MAX_LOG_NOISE))
+        return Residuals(self.features[steps], self.residual[steps], self.head)
 
 
 class Onlooker(NamedTuple):
@@ -103,13 +94,8 @@ def _padded(
 
 
 def _of_head(seen: Seen, member: int, head: int) -> Residuals:
-    logvar = np.zeros(len(seen.residual))
-    if seen.logvar is not None:
-        logvar = np.asarray(seen.logvar[:, member, head], np.float64).mean(-1)
     features, residual = seen.features[:, member], seen.residual[:, member, head]
-    return Residuals(
-        np.asarray(features, np.float64), np.asarray(residual, np.float64), logvar, head
-    )
+    return Residuals(np.asarray(features, np.float64), np.asarray(residual, np.float64), head)
 
 
 @eqx.filter_jit

@@ -24,8 +24,6 @@ class SearchState(NamedTuple):
 
     guess: Float[Array, "env horizon action"]
     """Where to start, within [-1, 1]; also the answer if every return is non-finite."""
-    variance: Float[Array, "env horizon action"] | None = None
-    """How widely to search around the guess."""
     elites: Float[Array, "env elite horizon action"] | None = None
     """Good sequences to try again; infinite where an action is unknown, to be drawn."""
 
@@ -57,7 +55,7 @@ class Optimizer(eqx.Module):
     @property
     @abc.abstractmethod
     def max_evaluations(self) -> int:
-        """Candidates scored for one environment's plan; fewer where a search stops early."""
+        """Candidates scored for one environment's plan; fewer where it is cut off."""
 
     def init(self, num_envs: int, horizon: int, action_size: int) -> SearchState:
         """Know nothing yet: start from actions of zero."""
@@ -115,10 +113,6 @@ class Optimizer(eqx.Module):
         """The first iteration that is compiled alike; by default all are."""
         del iteration
         return 0
-
-    def settled(self, search: Any) -> Bool[Array, " env"]:
-        """Where the search needs no further iteration; nowhere, by default."""
-        return jnp.zeros(len(self.end(search).actions), bool)
 
     def optimize(self, score: Score, state: SearchState, *, key: PRNGKeyArray) -> Plan:
         """Search for the best action sequence of every environment.
