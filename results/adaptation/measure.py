@@ -16,12 +16,12 @@ from typing import Any
 
 import headway
 from headway.config import Config
-from headway.experiment.progress import make_progress
 from headway.report.tables import by_physics
 from headway.settings import override
 from headway.storage.records import read_csv, write_csv
 from headway.storage.run_dir import RunDir
 from headway.storage.tables import EVALUATION_COLUMNS, EpisodeRow
+from headway.training.progress import make_progress
 
 COLUMNS = (
     "run", "env", "method", "seed", "arm", "group", "sim_params", "settings", "episodes",

@@ -8,13 +8,13 @@ from typing import Any, overload
 from headway.config import Config
 from headway.experiment.evaluation import PlanningCost, episode_rows
 from headway.experiment.methods import make_config
-from headway.experiment.progress import Progress
 from headway.experiment.testing import run_tests
 from headway.experiment.training import train_run
 from headway.planning.controller import Controller
 from headway.report.figures import save_run_figures
 from headway.service import load
 from headway.storage.tables import EpisodeRow
+from headway.training.progress import Progress
 
 
 @dataclasses.dataclass(frozen=True)

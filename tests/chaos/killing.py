@@ -8,9 +8,9 @@ from pathlib import Path
 from headway.config import Config
 from headway.experiment import training
 from headway.experiment.methods import make_config
-from headway.experiment.progress import Progress
 from headway.storage import files, progress_store
 from headway.storage.run_dir import RunDir
+from headway.training.progress import Progress
 
 TINY = {
     "collection.episode_length": 6,
@@ -104,7 +104,7 @@ class KillingProgress(Progress):
     def __init__(self, trigger: Trigger):
         self._trigger = trigger
 
-    def phase(self, iteration, num_iterations, name, total):
+    def phase(self, name, total):
         self._trigger.pull()
 
     def advance(self, amount=1, **values):

@@ -9,7 +9,7 @@ from killing import ALWAYS, NEVER, Killed, Trigger
 
 from headway.errors import LimitError
 from headway.experiment import training
-from headway.experiment.progress import Progress
+from headway.training.progress import Progress
 
 
 @pytest.fixture(scope="module")

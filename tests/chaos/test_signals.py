@@ -16,12 +16,12 @@ from killing import ALWAYS, NEVER
 from headway.errors import BadEnvironmentError
 from headway.experiment import resumable, training
 from headway.experiment.learners import multi_headed
-from headway.experiment.progress import Progress
 from headway.experiment.rollouts import Choice
 from headway.planning.acting import RandomAgent
 from headway.storage import progress_store
 from headway.storage.interrupts import StopRequest, Terminated
 from headway.storage.progress_store import ProgressStore
+from headway.training.progress import Progress
 
 
 class Signalling(Progress):

@@ -11,11 +11,11 @@ import headway
 from headway.errors import ConfigError, PlanningError, RunError, UnknownNameError
 from headway.experiment import loading, training
 from headway.experiment.methods import make_config
-from headway.experiment.progress import Progress
 from headway.storage import arrays
 from headway.storage.interrupts import StopRequest
 from headway.storage.run_dir import RunDir
 from headway.tasks.catalog import env_names
+from headway.training.progress import Progress
 
 TINY = {"collection.episode_length": 12, "fitting.epochs": 1}
 

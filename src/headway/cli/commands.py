@@ -36,7 +36,7 @@ def train(words: Sequence[str]) -> int:
     """`headway train`."""
     arguments, settings = parse_train(words)
     from headway import api
-    from headway.experiment.progress import make_progress
+    from headway.training.progress import make_progress
 
     run = api.train(
         arguments.env,
@@ -85,7 +85,7 @@ def evaluate(words: Sequence[str]) -> int:
     """`headway evaluate`."""
     arguments, settings = parse_for_run(Evaluate(run=tyro.MISSING), words, "headway evaluate")
     from headway import api
-    from headway.experiment.progress import make_progress
+    from headway.training.progress import make_progress
 
     found = api.evaluate(
         arguments.run,

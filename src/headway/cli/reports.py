@@ -29,8 +29,8 @@ def report(words: Sequence[str]) -> int:
 def diagnose(words: Sequence[str]) -> int:
     """`headway diagnose`."""
     arguments, settings = parse_for_run(Diagnose(run=tyro.MISSING), words, "headway diagnose")
-    from headway.experiment.progress import make_progress
     from headway.report import diagnosis
+    from headway.training.progress import make_progress
 
     found = diagnosis.diagnose(
         arguments.run,
@@ -49,9 +49,9 @@ def diagnose(words: Sequence[str]) -> int:
 def record(words: Sequence[str]) -> int:
     """`headway record`."""
     arguments, settings = parse_for_run(Record(run=tyro.MISSING), words, "headway record")
-    from headway.experiment.progress import make_progress
     from headway.report import recording
     from headway.storage.files import check_target
+    from headway.training.progress import make_progress
 
     check_target(arguments.output)
     found = recording.record(

@@ -10,7 +10,6 @@ from jaxtyping import PRNGKeyArray
 from headway.config import Config
 from headway.data import Trajectory
 from headway.experiment.bad_episodes import BadEpisodes
-from headway.experiment.progress import Progress
 from headway.experiment.resumable import resumable_episodes
 from headway.experiment.rollouts import (
     AgentPolicy,
@@ -25,6 +24,7 @@ from headway.sim_params import SimParamSets
 from headway.storage.progress_store import ProgressStore
 from headway.storage.tables import EpisodeRow
 from headway.tasks.base import Task
+from headway.training.progress import Progress
 
 GROUP_SEEDS = 1000  # seeds reserved for each group, so that groups never share an episode
 

@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float
 
 from headway.errors import RunError
-from headway.experiment.progress import Progress
 from headway.experiment.rollouts import (
     AgentPolicy,
     Arena,
@@ -31,6 +30,7 @@ from headway.storage.arrays import tree_arrays, tree_from_arrays
 from headway.storage.files import damaged
 from headway.storage.progress_store import Part, ProgressStore
 from headway.storage.records import trajectories_from, trajectory_arrays, trajectory_facts
+from headway.training.progress import Progress
 
 _KEPT = ("action", "failures", "evaluations")  # of every choice
 

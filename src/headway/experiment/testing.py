@@ -15,10 +15,10 @@ from headway.experiment.evaluation import Tests, evaluate_agent, trajectories_of
 from headway.experiment.limits import check_memory, make_room_for_programs
 from headway.experiment.loading import load_agent, need_of
 from headway.experiment.methods import config_to_evaluate
-from headway.experiment.progress import Progress
 from headway.experiment.rollouts import Arena, PlannerUse
 from headway.planning.acting import Acting
 from headway.storage.run_dir import RunDir
+from headway.training.progress import Progress
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +78,7 @@ def run_tests(
         groups = known_groups(groups, arena.sim_params.group_names)
         iteration = run.finished_iterations - 1
         total = len(groups) * config.evaluation.num_episodes * arena.episode_length
-        shown.phase(iteration, run.finished_iterations, "evaluate", total)
+        shown.phase("evaluate", total)
         key = jax.random.key(config.evaluation.seed)
         found, use = evaluate_agent(agent, arena, config, groups, key=key, progress=shown)
     return Tested(config, iteration, agent, arena, found, use)

@@ -20,7 +20,6 @@ from headway.experiment.learners import Fit, Learned, Learner, make_learner
 from headway.experiment.limits import check_memory, make_room_for_programs
 from headway.experiment.loading import initial, load_learned, need_of
 from headway.experiment.methods import check_block
-from headway.experiment.progress import Progress
 from headway.experiment.resumable import (
     fit_part,
     fitted_before,
@@ -43,6 +42,7 @@ from headway.storage import arrays
 from headway.storage.interrupts import StopRequest, stop_requests
 from headway.storage.progress_store import ProgressStore
 from headway.storage.run_dir import RunDir
+from headway.training.progress import Progress
 
 
 class Keys(NamedTuple):
@@ -108,9 +108,6 @@ class Trainer:
             Terminated: SIGTERM was sent; everything is saved.
         """
         todo = range(self.run.finished_iterations, self.config.collection.num_iterations)
-        work = [(i, self.amount_of_work(i)) for i in todo]
-        phases = [(i, name, total) for i, amounts in work for name, total in amounts.items()]
-        self.progress.schedule(phases)
         for iteration in todo:
             try:
                 self.run_iteration(iteration)
@@ -128,7 +125,8 @@ class Trainer:
     def phase(self, iteration: int, name: str) -> None:
         """Announce what comes next."""
         total = self.amount_of_work(iteration)[name]
-        self.progress.phase(iteration, self.config.collection.num_iterations, name, total)
+        place = f"[{iteration + 1}/{self.config.collection.num_iterations}]"
+        self.progress.phase(f"{place} {name}", total)
 
     def amount_of_work(self, iteration: int) -> dict[str, int]:
         """Environment steps or epochs of each phase of an iteration."""

@@ -13,7 +13,6 @@ from headway.data import Trajectory
 from headway.errors import ConfigError
 from headway.experiment.loading import finished_iterations, load_agent
 from headway.experiment.methods import config_to_control
-from headway.experiment.progress import Progress
 from headway.experiment.selection import (
     LEVELS,
     EpisodeSelection,
@@ -27,6 +26,7 @@ from headway.report.physics import distinct, full_label, varying
 from headway.report.tables import new_table
 from headway.storage.run_dir import RunDir
 from headway.tasks.catalog import sim_param_sets
+from headway.training.progress import Progress
 
 Facts = dict[str, Any]
 

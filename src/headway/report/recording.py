@@ -14,13 +14,13 @@ from headway.envs.schedule import Schedule
 from headway.errors import BadEnvironmentError, ConfigError
 from headway.experiment.loading import load_agent
 from headway.experiment.methods import config_to_evaluate
-from headway.experiment.progress import Progress
 from headway.planning.controller import Controller
 from headway.report import film
 from headway.report.film import Moment
 from headway.storage import files
 from headway.storage.run_dir import RunDir
 from headway.tasks.catalog import env_options, episode_length
+from headway.training.progress import Progress
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +82,7 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
     options = {"sim_params": dict(sim_params or {}), "schedule": dict(schedule or {})}
     moments: list[Moment] = []
     with progress or Progress() as shown:
-        shown.phase(0, 1, "act", length)
+        shown.phase("act", length)
         for moment in _episode(env, controller, options, seed, length):
             moments.append(moment)
             shown.advance()

@@ -7,7 +7,6 @@ from types import TracebackType
 from typing import Self, TextIO
 
 from headway.errors import HeadwayError
-from headway.experiment.progress import duration
 from headway.sweeps.jobs import Job
 from headway.sweeps.status import Status, reason
 
@@ -75,10 +74,9 @@ class PlainBoard(Board):
         if (before.state, before.iteration) == (status.state, status.iteration):
             return
         done = sum(one.over for one in self.statuses.values())
-        left = f"; about {duration(status.left)} left" if status.left else ""
         words = [status.state, f"{status.iteration}/{job.num_iterations}", status.returns]
         line = "  ".join(word for word in (*words, status.note) if word)
-        self.message(f"[{done}/{len(self.jobs)}] {describe(job)}: {line}{left}")
+        self.message(f"[{done}/{len(self.jobs)}] {describe(job)}: {line}")
 
     def message(self, text: str) -> None:
         """Print a line."""

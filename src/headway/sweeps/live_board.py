@@ -7,7 +7,6 @@ from rich.table import Table
 from rich.text import Text
 
 from headway.experiment.live_display import LiveDisplay
-from headway.experiment.progress import duration
 from headway.sweeps.board import Board, describe
 from headway.sweeps.jobs import Job
 from headway.sweeps.status import Status
@@ -40,7 +39,7 @@ class LiveBoard(LiveDisplay, Board):
         if not self.jobs:
             return Text("preparing ...", style="dim")
         shown = self._busiest(max(self._console.height - _OTHER_LINES, 3))
-        table = Table("run", "state", "iteration", "doing", "returns", "left", box=None)
+        table = Table("run", "state", "iteration", "doing", "returns", box=None)
         for job in shown:
             status = self.statuses[job.path]
             table.add_row(
@@ -49,7 +48,6 @@ class LiveBoard(LiveDisplay, Board):
                 f"{status.iteration}/{job.num_iterations}",
                 status.phase if status.state == "running" else "",
                 status.returns,
-                duration(status.left) if status.left and status.state == "running" else "",
             )
         return Group(table, Text(self._summary(len(shown)), style="dim"))
 

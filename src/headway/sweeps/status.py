@@ -2,11 +2,11 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, Self
 
 from headway.errors import HeadwayError
-from headway.experiment.progress import Clock, Estimate, Phase, Progress, summarise_returns
+from headway.training.progress import Progress
 
 State = Literal["waiting", "running", "busy", "lost", "done", "failed"]
 
@@ -26,8 +26,6 @@ class Status:
     """What is being done, and how much of it."""
     returns: str = ""
     """The newest returns."""
-    left: float | None = None
-    """Seconds left, None while not known."""
     note: str = ""
     """Why it failed."""
     messages: tuple[str, ...] = ()
@@ -40,6 +38,16 @@ class Status:
 
 
 Tell = Callable[[Status], None]
+
+
+def duration(seconds: float) -> str:
+    """Word a duration, for example `3 min 20 s`."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
 def reason(error: BaseException) -> str:
@@ -59,11 +67,10 @@ class StatusProgress(Progress):
         clock: Seconds, for tests.
     """
 
-    def __init__(self, tell: Tell, iteration: int = 0, *, clock: Clock = time.monotonic):
+    def __init__(self, tell: Tell, iteration: int = 0, *, clock: Any = time.monotonic):
         self._tell, self._clock = tell, clock
-        self._estimate = Estimate(clock)
         self._status = Status("running", iteration, "preparing")
-        self._name, self._total = "", 1
+        self._name, self._total, self._done = "", 1, 0
         self._told = clock()
 
     def __enter__(self) -> Self:
@@ -71,26 +78,23 @@ class StatusProgress(Progress):
         self._tell(self._status)
         return self
 
-    def schedule(self, phases: Sequence[Phase]) -> None:
-        """Take over the announced phases."""
-        self._estimate.schedule(phases)
-
-    def phase(self, iteration: int, num_iterations: int, name: str, total: int) -> None:
+    def phase(self, name: str, total: int) -> None:
         """Start a phase."""
-        self._estimate.start(iteration, num_iterations, name, total)
-        self._name, self._total = name, max(total, 1)
-        self._report(iteration=iteration)
+        self._name, self._total, self._done = name, max(total, 1), 0
+        self._report()
 
     def advance(self, amount: int = 1, **values: float) -> None:
         """Count finished work."""
-        self._estimate.advance(amount)
+        self._done += amount
         if self._clock() - self._told >= EVERY:
             self._report()
 
     def iteration_done(self, metrics: Mapping[str, Any]) -> None:
         """Take over the iteration's returns."""
-        self._estimate.finish()
-        returns = "  ".join(summarise_returns(metrics))
+        found = {"collected": metrics["collection"], **metrics.get("evaluation", {})}
+        returns = "  ".join(
+            f"{name} {one['return_mean']:.4g}" for name, one in found.items() if one
+        )
         self._report(iteration=metrics["iteration"] + 1, returns=returns)
 
     def message(self, text: str) -> None:
@@ -99,9 +103,7 @@ class StatusProgress(Progress):
 
     def _report(self, **changes: Any) -> None:
         self._told = self._clock()
-        done = min(self._estimate.done / self._total, 1.0)
+        done = min(self._done / self._total, 1.0)
         phase = f"{self._name} {done:.0%}" if self._name else self._status.phase
-        self._status = dataclasses.replace(
-            self._status, phase=phase, left=self._estimate.left, **changes
-        )
+        self._status = dataclasses.replace(self._status, phase=phase, **changes)
         self._tell(self._status)

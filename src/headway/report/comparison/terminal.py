@@ -4,13 +4,13 @@ from typing import Any
 
 from rich.table import Table
 
-from headway.experiment.progress import duration
 from headway.report.comparison.runs import Found
 from headway.report.comparison.writing import table_columns, table_rows
 from headway.report.tables import new_table
 from headway.sweeps.cost import Plan
 from headway.sweeps.experiments import EXPERIMENTS
 from headway.sweeps.jobs import Comparison
+from headway.sweeps.status import duration
 
 Facts = dict[str, Any]
 

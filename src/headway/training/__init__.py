@@ -1,0 +1,1 @@
+"""Training: collect, fit, evaluate, and the run directory that keeps it."""
