@@ -6,7 +6,7 @@ from pathlib import Path
 
 import headway
 import headway.envs
-from headway.cli.commands import COMMANDS
+from headway.cli import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 SITE = ROOT / "docs/site"

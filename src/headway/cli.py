@@ -1,0 +1,693 @@
+"""The command `headway`: tyro parses the words, a command calls one library function and prints.
+
+Results go to stdout, progress and errors to stderr. Exit codes: 0 done, 1 an error of
+Headway's, 2 wrong usage, 130 interrupted, 143 terminated.
+"""
+
+import dataclasses
+import json
+import os
+import re
+import shlex
+import sys
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import tyro
+
+from headway import __version__
+from headway.config import (
+    CollectionConfig,
+    Config,
+    EvaluationConfig,
+    FittingConfig,
+    ModelConfig,
+    PlannerConfig,
+)
+from headway.errors import ConfigError, HeadwayError, unknown_name
+
+MAX_SEEDS = 1000
+PIPE_WIDTH = 130
+RESUMABLE = ("train", "reproduce", "sweep")
+TERMINATED = 143  # as a shell reports SIGTERM
+PAPER_ENVS = (
+    "cartpole-swingup", "pendulum", "hopper", "slim-humanoid", "half-cheetah", "crippled-ant",
+)  # fmt: skip
+
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
+Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+EnvName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
+RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+
+
+def _unless_given(text: str):
+    """Say in words what happens by default."""
+    return tyro.conf.arg(help_behavior_hint=f"(default: {text})")
+
+
+@dataclasses.dataclass(frozen=True)
+class Names:
+    """The words of a line that say whose settings are the defaults of all others."""
+
+    words: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """First of all an environment or a run."""
+    method: str = "tmcl"
+    preset: str = "paper"
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Options of every command."""
+
+    json: Flag = False
+    """Print one JSON line of results on stdout."""
+    quiet: Flag = False
+    """Show no progress."""
+
+    def run(self, words: Sequence[str]) -> int:
+        """Do it, and return the exit code; `words` are those that asked for it."""
+        raise NotImplementedError
+
+    def with_defaults(self, names: Names) -> Self:
+        """Take the settings of what is named."""
+        del names
+        return self
+
+    def show(self, facts: Mapping[str, Any], *tables: Any) -> int:
+        """Print facts as one JSON line, or tables and text for people."""
+        if self.json:
+            print(json.dumps(facts, allow_nan=False))
+            return 0
+        from rich.console import Console
+
+        console = Console(width=None if sys.stdout.isatty() else PIPE_WIDTH, highlight=False)
+        for table in tables:
+            if isinstance(table, str):
+                print(table)
+            else:
+                console.print(table)
+        return 0
+
+    def progress(self) -> Any:
+        """Make what shows the progress of training and tests."""
+        from headway.training.progress import make_progress
+
+        return make_progress(self.quiet)
+
+    def changed(self, config: Config) -> dict[str, Any]:
+        """Settings by dotted name that differ from those of a configuration."""
+        return {
+            f"{section}.{name}": value
+            for section in ("model", "fitting", "planner", "collection", "evaluation")
+            for name, value in vars(getattr(self, section, config)).items()
+            if hasattr(self, section) and value != getattr(getattr(config, section), name)
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class Train(Command):
+    """Train a controller on an environment whose physics vary; resume if it was begun before.
+
+    The defaults shown are those of the environment, method and preset named before --help. Name
+    ENV first: without it they are those of the preset paper.
+    """
+
+    env: EnvName = tyro.MISSING
+    """Short name or id of an environment; `headway list envs` shows them."""
+    method: str = "tmcl"
+    """What to train; `headway list methods` shows the choice."""
+    preset: str = "paper"
+    """At which scale; `headway list presets` shows the choice."""
+    seed: int = 0
+    """Makes the run repeatable."""
+    run_dir: Annotated[Path | None, _unless_given("runs/ENV-METHOD-PRESET-seedSEED")] = None
+    """Where everything is written."""
+    sim_params: Annotated[Path | None, _unless_given("the environment's own")] = None
+    """A JSON file with the training and unseen physics."""
+    env_options: Annotated[tuple[str, ...], _unless_given("those of the preset")] = ()
+    """Switches of the environment: NAME=on or NAME=off."""
+    resume_from_last_good: Flag = False
+    """Where a file of the run is damaged, go back to the newest iteration that is intact."""
+    ignore_limits: Flag = False
+    """Try what seems too large for the free memory."""
+    model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
+    fitting: FittingConfig = dataclasses.field(default_factory=FittingConfig)
+    planner: PlannerConfig = dataclasses.field(default_factory=PlannerConfig)
+    collection: CollectionConfig = dataclasses.field(default_factory=CollectionConfig)
+    evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
+
+    def with_defaults(self, names):
+        """Take the settings of environment, method and preset."""
+        from headway.experiment.methods import make_config
+
+        if not names.words:
+            return self
+        config = make_config(names.words[0], method=names.method, preset=names.preset)
+        taken = ("method", "preset", "model", "fitting", "planner", "collection", "evaluation")
+        return dataclasses.replace(self, **{name: getattr(config, name) for name in taken})
+
+    def settings(self) -> dict[str, Any]:
+        """Settings by dotted name that differ from those of method and preset."""
+        from headway.experiment.methods import make_config
+        from headway.tasks.catalog import env_spec
+
+        config = make_config(self.env, method=self.method, preset=self.preset)
+        settings = self.changed(config)
+        if self.env_options:
+            spec, options = env_spec(self.env), dict(config.env_options)
+            for word in self.env_options:
+                name, _, value = word.replace("-", "_").partition("=")
+                if name not in spec.options:
+                    raise unknown_name(f"{spec.name} option", name, spec.options)
+                if value not in ("on", "off"):
+                    raise ConfigError(f"--env-options is {word!r}, allowed: {name}=on or =off.")
+                options[name] = value == "on"
+            settings["env_options"] = options
+        if self.sim_params is not None:
+            try:
+                settings["sim_params"] = json.loads(self.sim_params.read_text())
+            except (ValueError, RecursionError) as error:
+                raise ConfigError(
+                    f"{self.sim_params} is not JSON ({error}); write training and unseen sets."
+                ) from None
+        return settings
+
+    def run(self, words):
+        """Train, print the last tests, and what to do next."""
+        settings = self.settings()
+        from headway import api
+        from headway.report import tables
+
+        run = api.train(
+            self.env,
+            method=self.method,
+            preset=self.preset,
+            seed=self.seed,
+            run_dir=self.run_dir,
+            settings=settings,
+            progress=self.progress(),
+            resume_from_last_good=self.resume_from_last_good,
+            ignore_limits=self.ignore_limits,
+        )
+        last = max((row.iteration for row in run.evaluation), default=0)
+        rows = [row for row in run.evaluation if row.iteration == last]
+        facts = {
+            "run_dir": str(run.path),
+            **{name: getattr(run.config, name) for name in ("env", "method", "preset", "seed")},
+            "iterations": len(run.metrics),
+            "timesteps": run.metrics[-1]["timesteps"],
+            "groups": tables.by_group(rows, run.config),
+            "physics": tables.by_physics(rows, run.config),
+            "figures": [str(path) for path in run.figures],
+        }
+        title = f"{run.config.env}, {run.config.method} after {len(run.metrics)} iterations"
+        again = shlex.join(["headway", *words])
+        return self.show(
+            facts,
+            tables.evaluation(rows, run.config, title),
+            "\n  ".join(["Figures:", *map(str, run.figures)]),
+            f"Test it again:\n  {shlex.join(['headway', 'evaluate', str(run.path)])}",
+            f"The command, which resumes what was interrupted:\n  {again}",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class _OfRun(Command):
+    """A command about a trained run, whose settings are the defaults."""
+
+    run_dir: RunPath = tyro.MISSING
+    """The run directory."""
+    planner: PlannerConfig = dataclasses.field(default_factory=PlannerConfig)
+
+    def config(self) -> Config:
+        """Read the settings of the run."""
+        from headway.storage.run_dir import RunDir
+
+        return RunDir(self.run_dir).config()
+
+    def with_defaults(self, names):
+        """Take the settings of the run."""
+        if not names.words:
+            return self
+        config = dataclasses.replace(self, run_dir=Path(names.words[0])).config()
+        taken = [name for name in ("planner", "evaluation") if hasattr(self, name)]
+        return dataclasses.replace(self, **{name: getattr(config, name) for name in taken})
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate(_OfRun):
+    """Test a trained run on training and unseen physics; nothing in its directory changes.
+
+    It can be tested with another planner than it was trained with. The defaults shown are those
+    of the run named before --help.
+    """
+
+    group: Annotated[tuple[str, ...], _unless_given("all of them")] = ()
+    """Groups of physics: `train` or unseen groups."""
+    episodes: Annotated[int | None, _unless_given("as in the run's own tests")] = None
+    """Episodes per group; the same as --evaluation.num-episodes."""
+    evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
+
+    def run(self, words):
+        """Test, print returns per physics, and what planning took."""
+        settings = self.changed(self.config())
+        from headway import api
+        from headway.report import tables
+
+        found = api.evaluate(
+            self.run_dir,
+            groups=self.group or None,
+            num_episodes=self.episodes,
+            settings=settings,
+            progress=self.progress(),
+        )
+        cost, config = found.cost, found.config
+        facts = {
+            "run_dir": str(self.run_dir),
+            "settings": settings,
+            "planning": dataclasses.asdict(cost),
+            "groups": tables.by_group(found, config),
+            "physics": tables.by_physics(found, config),
+        }
+        took = f"{cost.evaluations_per_step:,.0f} candidates, {cost.flop_per_step / 1e9:.3g} GFLOP"
+        if cost.seconds_per_step is not None:
+            took += f", {1e3 * cost.seconds_per_step:.3g} ms"
+        table = tables.evaluation(found, config, str(self.run_dir))
+        return self.show(facts, table, f"Planning took {took} per step.")
+
+
+@dataclasses.dataclass(frozen=True)
+class Record(_OfRun):
+    """Film an episode of a trained run, with the heads that it plans with; GIF or WebP.
+
+    The defaults shown are those of the run named before --help.
+    """
+
+    output: Output = Path("episode.gif")
+    """The file to write; .gif or .webp."""
+    sim_params: Annotated[tuple[str, ...], _unless_given("drawn from the training physics")] = ()
+    """Physics, for example length=1.75."""
+    schedule: Annotated[tuple[str, ...], _unless_given("physics stay")] = ()
+    """Physics that change during the episode, for example 60:length=0.5 120:length=1."""
+    seed: int = 0
+    """Seeds the start and the planner."""
+    steps: Annotated[int | None, _unless_given("a full episode")] = None
+    """Steps to film."""
+
+    def run(self, words):
+        """Film, and print where the film is."""
+        schedule: dict[int, dict[str, float]] = {}
+        for word in self.schedule:
+            found = re.fullmatch(r"(\d{1,9}):(.*)", word)
+            if not found:
+                raise ConfigError(
+                    f"--schedule is {word!r}, allowed: a step and what changes then, as in"
+                    " 60:length=0.5."
+                )
+            schedule.setdefault(int(found[1]), {}).update(_physics([found[2]], "--schedule"))
+        settings = self.changed(self.config())
+        from headway.report import recording
+        from headway.storage.files import check_target
+
+        check_target(self.output)
+        film = recording.record(
+            self.run_dir,
+            self.output,
+            sim_params=_physics(self.sim_params, "--sim-params"),
+            schedule=schedule,
+            seed=self.seed,
+            num_steps=self.steps,
+            settings=settings,
+            progress=self.progress(),
+        )
+        facts = {"film": str(film.path), "env": film.env, "steps": film.steps}
+        text = f"{film.path}: {film.steps} steps, return {film.episode_return:.1f}"
+        return self.show({**facts, "return": film.episode_return}, text)
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnose(_OfRun):
+    """Measure how well a trained run selects heads, and how well it knows its own error.
+
+    It looks at the run's own last test episodes; nothing in its directory changes. With planner
+    settings: how heads would be selected in these episodes. The defaults shown are those of the
+    run named before --help.
+    """
+
+    group: Annotated[tuple[str, ...], _unless_given("all of them")] = ()
+    """Groups of physics: `train` or unseen groups."""
+    episodes: Annotated[int | None, _unless_given("the run's own tests, not run again")] = None
+    """Run tests with so many episodes per group."""
+    collected: Flag = False
+    """Take the episodes that the last iteration collected: training physics only, and the model has
+    learned from them since."""
+
+    def run(self, words):
+        """Diagnose, and print tables."""
+        settings = self.changed(self.config())
+        from headway.report import diagnosis
+
+        found = diagnosis.diagnose(
+            self.run_dir,
+            groups=self.group or None,
+            num_episodes=self.episodes,
+            collected=self.collected,
+            settings=settings,
+            progress=self.progress(),
+        )
+        return self.show(diagnosis.facts(found), *diagnosis.tables(found))
+
+
+@dataclasses.dataclass(frozen=True)
+class Report(Command):
+    """Compare runs on one HTML page that needs nothing else: no network, no other file."""
+
+    runs: Annotated[
+        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")
+    ] = tyro.MISSING
+    """Run directories, or folders that hold some; any methods, environments and seeds."""
+    output: Output = Path("report.html")
+    """The HTML file to write."""
+    only: Annotated[tuple[str, ...], _unless_given("all of them")] = ()
+    """Chapters to make, for example `learning-curves` or `contexts`."""
+
+    def run(self, words):
+        """Write the page, and print where it is."""
+        from headway.report.page.build import write_report
+        from headway.storage.files import check_target
+
+        check_target(self.output)
+        path = str(write_report(self.runs, self.output, only=self.only))
+        return self.show({"report": path}, path)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Runs(Command):
+    """Options of the commands that make many runs."""
+
+    envs: Annotated[tuple[str, ...], _unless_given("the paper's six")] = PAPER_ENVS
+    """Environments; `headway list envs` shows them."""
+    seeds: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SEED|FROM:TO")] = ("0:3",)
+    """Seeds, or ranges without their end: 0:3 is 0 1 2."""
+    preset: str = "paper"
+    """At which scale; `headway list presets` shows the choice."""
+    out: Path = Path("runs/reproduce")
+    """Where runs and results go; runs that are there already are used."""
+    settings: Annotated[tuple[str, ...], _unless_given("none")] = ()
+    """Settings as NAME=VALUE, for example collection.num_iterations=3; `headway sweep` takes
+    several values, for example planner.horizon=10,20, and combines them all."""
+    dry_run: Flag = False
+    """List what would be run and about how long it takes, and run nothing."""
+    one_by_one: Flag = False
+    """Let runs go one after another in this process, even where Ray is installed."""
+    address: Annotated[str | None, _unless_given("Ray on this machine")] = None
+    """A Ray cluster, for example `auto`; it must see --out under the same path."""
+    cpus_per_run: float = 1.0
+    """Cores that one run reserves, and threads that it computes with."""
+    gpus_per_run: Annotated[float | None, _unless_given("1 where there are GPUs")] = None
+    """GPUs that one run reserves; a fraction lets several share one."""
+
+    def compare(self, experiment: Any, settings: Mapping[str, Any], words: Sequence[str]) -> int:
+        """Make the runs that are missing, and print what all of them found."""
+        from headway.sweeps.jobs import Comparison
+
+        seeds = read_seeds(self.seeds)
+        comparison = Comparison(experiment, self.envs, seeds, self.preset, self.out, settings)
+        if self.dry_run:
+            from headway.report.comparison.terminal import plan
+            from headway.sweeps.cost import make_plan
+
+            planned = make_plan(comparison.jobs)
+            entries, table = plan(comparison, planned)
+            return self.show({**entries, "note": planned.note}, table, planned.note)
+        from headway import compare
+        from headway.report.comparison.terminal import results
+        from headway.sweeps.board import make_board
+        from headway.sweeps.running import Workers
+
+        command = shlex.join(["headway", *words])
+        done = compare.reproduce(
+            comparison,
+            workers=Workers(self.one_by_one, self.address, self.cpus_per_run, self.gpus_per_run),
+            board=make_board(self.quiet),
+            command=command,
+        )
+        for path, reason in done.failures.items():
+            print(f"failed: {path}: {reason}", file=sys.stderr)
+        facts = {
+            "experiment": comparison.experiment.name,
+            "runs": len(comparison.jobs),
+            "failures": {str(path): reason for path, reason in done.failures.items()},
+            "returns": [point._asdict() for point in done.found.final_points],
+            "files": [str(path) for path in done.files],
+        }
+        self.show(
+            facts,
+            *results(done.found),
+            "\n  ".join(["Written:", *map(str, done.files)]),
+            f"The command, which resumes what was interrupted:\n  {command}",
+        )
+        return 1 if done.failures else 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Reproduce(_Runs):
+    """Run what is missing of an experiment of the paper, and draw and tabulate it.
+
+    The figure compares the runs; `headway report OUT/runs` shows what is inside each of them.
+    """
+
+    experiment: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERIMENT")] = (
+        tyro.MISSING
+    )
+    """An experiment; `headway list experiments` shows them."""
+
+    def run(self, words):
+        """Reproduce, with one value of each setting."""
+        from headway.sweeps.experiments import experiment
+
+        found = experiment(self.experiment)
+        grid = read_settings(self.settings)
+        for name, values in grid.items():
+            if len(values) > 1:
+                raise ConfigError(f"--settings {name} has {len(values)} values, allowed: one.")
+        return self.compare(found, {name: values[0] for name, values in grid.items()}, words)
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep(_Runs):
+    """Run methods in environments with seeds and settings, all of them with each other.
+
+    The figure compares the runs; `headway report OUT/runs` shows what is inside each of them.
+    """
+
+    methods: tuple[str, ...] = ("tmcl",)
+    """Methods; `headway list methods` shows them."""
+    name: str = "sweep"
+    """Names the folder of results in --out."""
+
+    def run(self, words):
+        """Sweep; settings with several values make arms."""
+        from headway.sweeps.experiments import sweep_experiment
+
+        asked = read_settings(self.settings)
+        grid = {name: values for name, values in asked.items() if len(values) > 1}
+        fixed = {name: values[0] for name, values in asked.items() if len(values) == 1}
+        return self.compare(sweep_experiment(self.name, self.methods, grid), fixed, words)
+
+
+@dataclasses.dataclass(frozen=True)
+class List(Command):
+    """List what can be named on the command line."""
+
+    what: Annotated[
+        Literal["envs", "methods", "presets", "experiments"],
+        tyro.conf.Positional,
+    ] = tyro.MISSING
+    """What to list."""
+
+    def run(self, words):
+        """Print a table of names."""
+        from headway.report import tables
+        from headway.report.comparison import terminal
+
+        tables_of = {"envs": tables.envs, "methods": tables.methods, "presets": tables.presets}
+        entries, table = {**tables_of, "experiments": terminal.experiments}[self.what]()
+        return self.show({self.what: entries}, table)
+
+
+@dataclasses.dataclass(frozen=True)
+class PlotDynamics(Command):
+    """Draw the next states of the same states and actions under each training physics."""
+
+    env: EnvName = tyro.MISSING
+    """Short name or id of an environment; `headway list envs` shows them."""
+    output: Annotated[
+        Path | None, tyro.conf.arg(aliases=["-o"]), _unless_given("ENV-dynamics.png")
+    ] = None
+    """The PNG file to write."""
+    num_states: int = 100
+    """States of the trajectory that are drawn."""
+    seed: int = 0
+    """Seeds the trajectory and its random actions."""
+
+    def run(self, words):
+        """Draw, and print where the figure is."""
+        if self.num_states < 1:
+            raise ConfigError(f"--num-states is {self.num_states}, allowed: at least 1.")
+        from headway.report import dynamics
+        from headway.storage.files import check_target
+        from headway.tasks.catalog import env_spec
+
+        name = env_spec(self.env).name
+        out = self.output or Path(f"{name}-dynamics.png")
+        check_target(out)
+        path = dynamics.plot_dynamics(name, out, num_states=self.num_states, seed=self.seed)
+        return self.show({"env": name, "figure": str(path)}, str(path))
+
+
+COMMANDS: dict[str, type[Command]] = {
+    "train": Train,
+    "evaluate": Evaluate,
+    "record": Record,
+    "diagnose": Diagnose,
+    "report": Report,
+    "reproduce": Reproduce,
+    "sweep": Sweep,
+    "list": List,
+    "plot-dynamics": PlotDynamics,
+}
+
+
+def parse(words: Sequence[str]) -> Command:
+    """Parse a command line.
+
+    The defaults of settings are those of what the line names (environment, method and preset, or
+    a run), so tyro reads the names first, and then everything with these defaults.
+
+    Raises:
+        HeadwayError: There is no such environment, method, preset or run.
+        SystemExit: The line is wrong (2), or asked for help (0); tyro has said what there is.
+    """
+    told = "Control that keeps making headway when the physics changes."
+    config = (tyro.conf.DisallowNone,)
+    if not words or words[0] not in COMMANDS:
+        commands: Any = typing.Union[  # noqa: UP007
+            tuple(
+                Annotated[
+                    cls, tyro.conf.subcommand(name, description=f"{cls.__doc__}".split("\n")[0])
+                ]
+                for name, cls in COMMANDS.items()
+            )
+        ]
+        return tyro.cli(commands, args=words, prog="headway", description=told, config=config)
+    command, rest = COMMANDS[words[0]], words[1:]
+    names, _ = tyro.cli(Names, args=rest, add_help=False, return_unknown_args=True)
+    default = command().with_defaults(names)
+    return tyro.cli(command, default=default, args=rest, prog=f"headway {words[0]}", config=config)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: The arguments; those of the process by default.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        SystemExit: As `parse`.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    if words == ["--version"]:
+        print(f"headway {__version__}")
+        return 0
+    stopped, code = "", 1
+    try:
+        code = parse(words).run(words)
+        sys.stdout.flush()
+        return code
+    except HeadwayError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        where = "" if error.filename is None else f"cannot use {error.filename}: "
+        print(f"error: {where}{error.strerror or error}", file=sys.stderr)
+    except KeyboardInterrupt:
+        stopped, code = "interrupted", 130
+    except SystemExit as stop:
+        if stop.code != TERMINATED:
+            raise
+        stopped, code = "terminated", TERMINATED
+    if stopped:
+        goes_on = words and words[0] in RESUMABLE
+        advice = "; the same command goes on where this one stopped" if goes_on else ""
+        print(f"{stopped}{advice}", file=sys.stderr)
+        if argv is None:  # XLA's threads may still compute, and would crash a slow exit
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+    return code
+
+
+def read_seeds(words: Sequence[str]) -> tuple[int, ...]:
+    """Read seeds and ranges, for example `0:3` or `0 4`.
+
+    Raises:
+        ConfigError: A word is neither.
+    """
+    seeds: list[int] = []
+    for word in words:
+        found = re.fullmatch(r"(\d{1,10})(?::(\d{1,10}))?", word)
+        first, last = (int(found[1]), int(found[2] or int(found[1]) + 1)) if found else (0, 0)
+        if not 0 < last - first <= MAX_SEEDS:
+            raise ConfigError(
+                f"--seeds is {word!r}, allowed: a whole number, or a range FIRST:LAST of up to"
+                f" {MAX_SEEDS} seeds that leaves out its last, as 0:3."
+            )
+        seeds += range(first, last)
+    return tuple(seeds)
+
+
+def read_settings(words: Sequence[str]) -> dict[str, list[Any]]:
+    """Read `NAME=VALUE` and `NAME=VALUE,VALUE`; values are JSON, or text where they are not.
+
+    Raises:
+        ConfigError: A word is not of that form.
+    """
+    grid: dict[str, list[Any]] = {}
+    for word in words:
+        name, _, text = word.partition("=")
+        name = name.replace("-", "_")
+        try:
+            values = json.loads(f"[{text}]")
+        except ValueError:
+            values = [_json_or_text(part.strip()) for part in text.split(",")]
+        if not name or not values or "" in values or name in grid:
+            raise ConfigError(
+                f"--settings is {word!r}, allowed: NAME=VALUE or NAME=VALUE,VALUE, each name once;"
+                " lists and tables are JSON."
+            )
+        grid[name] = values
+    return grid
+
+
+def _json_or_text(word: str) -> Any:
+    try:
+        return json.loads(word)
+    except ValueError:
+        return "" if word[:1] in ("[", "{", '"') else word  # begins as JSON and is none
+
+
+def _physics(words: Sequence[str], option: str) -> dict[str, float]:
+    """Read `length=0.5 mass=2`."""
+    from headway.storage.tables import parse_sim_params
+
+    try:
+        return parse_sim_params(" ".join(words))
+    except ValueError as error:
+        raise ConfigError(f"{option}: {error}.") from None

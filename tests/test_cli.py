@@ -1,0 +1,288 @@
+"""The command line: what it passes to the library, what it prints, its exit codes."""
+
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+
+import pytest
+
+from headway import api
+from headway.cli import COMMANDS, main, parse, read_seeds, read_settings
+from headway.errors import ConfigError, RunError
+from headway.experiment.evaluation import PlanningCost
+from headway.experiment.methods import METHODS, PRESETS, make_config
+from headway.storage.interrupts import Terminated
+from headway.storage.run_dir import RunDir
+from headway.storage.tables import EpisodeRow
+
+
+def run(capsys, *words):
+    """Exit code, stdout and stderr of one command."""
+    try:
+        code = main(words)
+    except SystemExit as stop:
+        code = stop.code
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def without_boxes(text):
+    return " ".join(text.replace("│", " ").split())
+
+
+def episode(group, length, value, iteration=1):
+    physics = {"length": length, "mass": 1.0}
+    return EpisodeRow("tmcl", "pendulum", 3, iteration, group, physics, 0, value, 200)
+
+
+ROWS = [
+    episode("train", 0.5, -126.0),
+    episode("train", 1.0, -131.0),
+    episode("unseen", 1.5, -1041.0),
+    episode("unseen", 1.5, -1141.0),
+]
+
+
+@pytest.fixture
+def calls(monkeypatch, tmp_path):
+    """What the command line asks of the library, which is replaced."""
+    made = []
+
+    def train(env, **asked):
+        made.append({"env": env, **asked})
+        config = make_config(env, method=asked["method"], preset=asked["preset"])
+        metrics = [{"timesteps": 100}, {"timesteps": 200}]
+        rows = [episode("train", 0.5, 0.0, iteration=0), *ROWS]
+        return api.Run(tmp_path / "run", config, metrics, rows, [tmp_path / "a.png"])
+
+    def evaluate(run_dir, **asked):
+        made.append({"run_dir": str(run_dir), **asked})
+        cost = PlanningCost(300.0, 2.5e9, 0.0125)
+        return api.Evaluation(ROWS, make_config("pendulum"), cost)
+
+    monkeypatch.setattr(api, "train", train)
+    monkeypatch.setattr(api, "evaluate", evaluate)
+    return made
+
+
+@pytest.fixture
+def trained(tmp_path):
+    """A run directory as far as its settings go."""
+    run_dir = RunDir(tmp_path / "trained")
+    run_dir.create_or_resume(make_config("pendulum", preset="quick"))
+    return str(run_dir.path)
+
+
+def test_top_help_and_version(capsys):
+    assert run(capsys, "--version")[1].startswith("headway ")
+    code, out, _ = run(capsys, "--help")
+    assert code == 0
+    assert set(re.findall(r"• ([a-z][\w-]*) ", out)) == set(COMMANDS)
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        ([], "Missing subcommand"),
+        (["trian"], "Available subcommands: train"),
+        (["train"], "ENV"),
+        (["train", "pendulum", "more"], "Unrecognized options: more"),
+        (["train", "pendulum", "--planner.horizn", "3"], "--planner.horizon INT"),
+        (["train", "pendulum", "--planner.horizon", "x"], "--planner.horizon: invalid"),
+        (["train", "pendulum", "--fitting.oracle", "trajectroy"], "'trajectory'"),
+        (["train", "pendulum", "--planner.num-elites", "900"], "num_elites is 900, allowed: "),
+        (["evaluate"], "RUN"),
+        (["list", "envs", "--jason"], "--json"),
+        (["list", "env"], "'envs'"),
+    ],
+)
+def test_wrong_usage_exits_2_and_says_what_there_is(capsys, calls, words, text):
+    code, out, err = run(capsys, *words)
+    assert (code, out) == (2, "")
+    assert text in without_boxes(err)
+    assert not calls
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["train", "pendulm"], "Did you mean 'pendulum'?"),
+        (["train", "pendulm", "--help"], "Did you mean 'pendulum'?"),
+        (["train", "pendulum", "--method", "tmlc"], "Did you mean 'tmcl'?"),
+        (["train", "pendulum", "--preset", "quik"], "Did you mean 'quick'?"),
+        (["train", "pendulum", "--env-options", "nothing=on"], "unknown pendulum option"),
+        (["train", "pendulum", "--sim-params", "missing.json"], "missing.json"),
+        (["evaluate", "nowhere", "--json"], "allowed: a run directory"),
+        (["plot-dynamics", "pendulum", "--num-states", "0"], "--num-states is 0, allowed: "),
+    ],
+)
+def test_errors_are_one_line_and_exit_1(capsys, calls, words, text):
+    code, out, err = run(capsys, *words)
+    assert (code, out) == (1, "")
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert text in err
+    assert not calls
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (RunError("two\nlines"), 1, "error: two lines\n"),
+        (KeyboardInterrupt(), 130, "interrupted; the same command goes on where this one stopped"),
+        (Terminated(143), 143, "terminated; the same command goes on where this one stopped"),
+    ],
+)
+def test_how_training_can_end(capsys, monkeypatch, error, code, said):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(api, "train", fail)
+    assert run(capsys, "train", "pendulum") == (code, "", said.rstrip("\n") + "\n")
+
+
+def asked(*words):
+    return parse(["train", *words]).settings()
+
+
+def test_settings_are_those_that_differ_from_the_preset():
+    words = "--preset quick --planner.horizon 7 --fitting.epochs 20 --model.hidden-sizes 8 9"
+    assert asked("pendulum", *words.split()) == {
+        "planner.horizon": 7,
+        "model.hidden_sizes": (8, 9),
+    }
+    assert asked("pendulum", "--model.no-backward-net") == {"model.backward_net": False}
+
+
+def test_physics_from_a_file(capsys, tmp_path):
+    sets = {"train": {"length": [0.5], "mass": [1.0]}, "unseen": {}}
+    path = tmp_path / "physics.json"
+    path.write_text(json.dumps(sets))
+    assert asked("pendulum", "--sim-params", str(path)) == {"sim_params": sets}
+    for text in ("{", "[" * 100_000):
+        path.write_text(text)
+        code, _, err = run(capsys, "train", "pendulum", "--sim-params", str(path))
+        assert code == 1
+        assert "is not JSON" in err
+
+
+def test_switches_of_the_environment():
+    assert asked("hopper", "--env-options", "scale-inertia=on")["env_options"] == {
+        "scale_inertia": True
+    }
+
+
+def test_help_shows_the_values_that_settings_would_have(capsys, trained):
+    for words in (["train", "pendulum", "--preset", "quick"], ["evaluate", trained]):
+        code, out, err = run(capsys, *words, "--help")
+        assert (code, err) == (0, "")
+        assert "--planner.horizon INT Imagined steps. (default: 20)" in without_boxes(out)
+    for command in COMMANDS:
+        assert run(capsys, command, "--help")[0] == 0
+
+
+def test_train_prints_a_table_the_figures_and_what_to_do_next(capsys, calls, tmp_path):
+    words = ("train", "pendulum", "--preset", "quick", "--seed", "3", "--ignore-limits", "--quiet")
+    code, out, err = run(capsys, *words)
+    assert (code, err) == (0, "")
+    for text in ("training", "length 0.5 m", "-1,091.0 ± 50.0", "1.00", str(tmp_path / "a.png")):
+        assert text in out
+    assert f"headway evaluate {tmp_path / 'run'}" in out
+    assert f"headway {' '.join(words)}" in out
+    assert (calls[0]["seed"], calls[0]["run_dir"], calls[0]["settings"]) == (3, None, {})
+    assert (calls[0]["resume_from_last_good"], calls[0]["ignore_limits"]) == (False, True)
+
+
+def test_train_json_is_one_line(capsys, calls, tmp_path):
+    code, out, _ = run(capsys, "train", "pendulum", "--json", "--preset", "quick")
+    assert (code, out.count("\n")) == (0, 1)
+    facts = json.loads(out)
+    assert (facts["run_dir"], facts["timesteps"]) == (str(tmp_path / "run"), 200)
+    train, unseen = facts["groups"]
+    assert (train["episodes"], train["return_mean"]) == (2, -128.5)
+    assert train["score"] == pytest.approx(1.0)
+    assert unseen["score"] == pytest.approx(-50 / (1041 - 203))
+    assert [part["sim_params"]["length"] for part in facts["physics"]] == [0.5, 1.0, 1.5]
+
+
+def test_evaluate_passes_groups_episodes_and_the_settings_that_differ(capsys, calls, trained):
+    words = "--group unseen train --episodes 5 --planner.num-candidates 50 --planner.horizon 20"
+    code, out, _ = run(capsys, "evaluate", trained, *words.split(), "--json")
+    assert code == 0
+    call, facts = calls[0], json.loads(out)
+    assert (call["run_dir"], call["groups"]) == (trained, ("unseen", "train"))
+    assert (call["num_episodes"], call["settings"]) == (5, {"planner.num_candidates": 50})
+    assert facts["settings"] == call["settings"]
+    assert facts["planning"] == dataclasses.asdict(PlanningCost(300.0, 2.5e9, 0.0125))
+    out = run(capsys, "evaluate", trained)[1]
+    assert "Planning took 300 candidates, 2.5 GFLOP, 12.5 ms per step." in out
+    assert (calls[1]["groups"], calls[1]["num_episodes"], calls[1]["settings"]) == (None, None, {})
+
+
+@pytest.mark.parametrize(
+    ("what", "names"), [("methods", METHODS), ("presets", PRESETS), ("envs", ["pendulum"])]
+)
+def test_list(capsys, what, names):
+    code, out, _ = run(capsys, "list", what)
+    assert code == 0
+    assert all(name in out for name in names)
+    listed = json.loads(run(capsys, "list", what, "--json")[1])[what]
+    assert set(names) <= {entry["name"] for entry in listed}
+
+
+def test_plot_dynamics(capsys, tmp_path):
+    out_file = tmp_path / "deep" / "picture.png"
+    words = ("plot-dynamics", "pendulum", "-o", str(out_file), "--num-states", "5", "--json")
+    code, out, _ = run(capsys, *words)
+    assert code == 0
+    assert json.loads(out) == {"env": "pendulum", "figure": str(out_file)}
+    assert out_file.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("words", "seeds"), [(["0:3"], (0, 1, 2)), (["4"], (4,)), (["1", "7:9"], (1, 7, 8))]
+)
+def test_seeds(words, seeds):
+    assert read_seeds(words) == seeds
+
+
+@pytest.mark.parametrize("word", ["x", "3:3", "3:1", "-1", "0:99999999", "1:2:3"])
+def test_bad_seeds(word):
+    with pytest.raises(ConfigError, match=r"--seeds is .*allowed"):
+        read_seeds([word])
+
+
+def test_settings_of_a_sweep_are_json_or_text():
+    words = ["model.hidden_sizes=[8,8],[9]", "planner.head-selection=average", "a=1,2.5"]
+    words += ['env_options={"x":true,"y":false},{"x":false}', "c=1, x,2.y,1e5z"]
+    assert read_settings(words) == {
+        "model.hidden_sizes": [[8, 8], [9]],
+        "planner.head_selection": ["average"],
+        "a": [1, 2.5],
+        "env_options": [{"x": True, "y": False}, {"x": False}],
+        "c": [1, "x", "2.y", "1e5z"],
+    }
+
+
+BAD_SETTINGS = ["a", "a=", "=1", "a=1,", "a=x,,y", "a=,", "a=[8,8", 'a={"x":true', "a=[1]2"]
+
+
+@pytest.mark.parametrize("words", [*([word] for word in BAD_SETTINGS), ["a=1", "a=2"]])
+def test_bad_settings_of_a_sweep(words):
+    with pytest.raises(ConfigError, match=r"--settings is"):
+        read_settings(words)
+
+
+def test_the_module_runs_and_help_loads_nothing_heavy():
+    code = (
+        "import sys, headway.cli\n"
+        "try: headway.cli.main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'jax', 'mujoco', 'gymnasium', 'matplotlib'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+    words = [sys.executable, "-m", "headway", "nonsense"]
+    assert subprocess.run(words, capture_output=True, check=False).returncode == 2
