@@ -14,7 +14,7 @@ CONSTRAINED_PYTHONS ?= python3.11 python3.12
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help demo test test-slow lint docs constraints clean
-.PHONY: bench bench-million bench-save bench-growth bench-peers bench-runs profile
+.PHONY: bench bench-save bench-growth bench-peers bench-runs profile
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' Makefile | awk -F'|' '{ printf "make %-14s %s\n", $$1, $$2 }'
@@ -36,9 +36,6 @@ lint: $(VENV)/test.stamp $(VENV)/lint.stamp ## Check style, types and import rul
 
 bench: $(VENV)/test.stamp $(VENV)/bench.stamp ## Time planning, fitting and environments; wants an idle machine
 	@$(BIN)/python -m pytest benchmarks -o python_files='bench_*.py' -p no:xdist --benchmark-quiet
-
-bench-million: $(VENV)/main.stamp ## Measure memory while fitting a million transitions, in minutes; Linux
-	@$(BIN)/python benchmarks/bench_million.py
 
 bench-save: $(VENV)/main.stamp ## Copy the latest results to results/speed/KIND/DATE.*
 	@$(BIN)/python benchmarks/save.py

@@ -1,7 +1,7 @@
 """Trajectories, the replay buffer, and the views of it that a model is fitted to."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,8 +17,7 @@ from headway.errors import BadEnvironmentError, ConfigError
 class Trajectory:
     """One episode under fixed physics.
 
-    Actions are scaled to [-1, 1]. An episode of T transitions has T + 1 observations. The
-    arrays may be read-only views of a memory-mapped file.
+    Actions are scaled to [-1, 1]. An episode of T transitions has T + 1 observations.
     """
 
     obs: Float[np.ndarray, "time_plus_1 obs"]
@@ -217,25 +216,8 @@ def segment_sums(
     return kept.reshape(*values.shape[:-1], num_segments, segment_length).sum(-1)
 
 
-def parts_of(trajectories: list[Trajectory], most: int) -> Iterator[list[Trajectory]]:
-    """Cut a list into parts of at most so many transitions; a longer trajectory is a part alone."""
-    part, size = [], 0
-    for trajectory in trajectories:
-        if part and size + len(trajectory) > most:
-            yield part
-            part, size = [], 0
-        part.append(trajectory)
-        size += len(trajectory)
-    if part:
-        yield part
-
-
 class ReplayBuffer:
-    """Every trajectory collected so far; nothing is ever discarded (supplement A.2).
-
-    A run's trajectories are views of its memory-mapped data files: they take memory only while
-    they are read, and the system may take it back.
-    """
+    """Every trajectory collected so far; nothing is ever discarded (supplement A.2)."""
 
     def __init__(self, obs_size: int, action_size: int):
         self.obs_size = obs_size

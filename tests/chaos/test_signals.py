@@ -79,16 +79,16 @@ def test_nothing_that_was_done_is_done_again(reference, tmp_path, monkeypatch):
     assert killing.result(tmp_path / "cut") == killing.result(reference)
 
 
-def test_a_fit_in_blocks_goes_on_at_the_epoch_where_it_stopped(tmp_path, monkeypatch):
-    config = killing.tiny_config(**{"fitting.block_transitions": 6})  # an episode each
+def test_a_fit_goes_on_at_the_epoch_where_it_stopped(tmp_path, monkeypatch):
+    config = killing.tiny_config()
     fits = []
-    fit = multi_headed.fit_blocks
+    fit = multi_headed.fit_epoch
 
     def counted(*asked, **named):
         fits.append(1)
         return fit(*asked, **named)
 
-    monkeypatch.setattr(multi_headed, "fit_blocks", counted)
+    monkeypatch.setattr(multi_headed, "fit_epoch", counted)
     training.train_run(config, tmp_path / "whole")
     whole = len(fits)
     fits.clear()

@@ -38,9 +38,7 @@ def test_smoke_run(method, env, tmp_path):
 @pytest.mark.parametrize("method", ["grbal", "rebal"])
 @pytest.mark.parametrize("broken", ["fit", "evaluate"])
 def test_interrupted_run_resumes_to_the_same_end(method, broken, tmp_path, monkeypatch):
-    # Blocks of one episode, so that dealing them out is repeated too.
-    settings = {**TINY, "fitting.block_transitions": 30}
-    config = make_config("pendulum", method=method, preset="smoke", settings=settings)
+    config = make_config("pendulum", method=method, preset="smoke", settings=TINY)
     training.train_run(config, tmp_path / "whole")
     interrupt(config, tmp_path / "cut", broken, monkeypatch)
     training.train_run(config, tmp_path / "cut")

@@ -47,16 +47,16 @@ def test_a_first_loss_may_be_large():
 
 def fail(monkeypatch, *, first, times):
     """Let some fits of epochs fail; returns the step size of every epoch that was fitted."""
-    plain, rates = multi_headed.fit_blocks, []
+    plain, rates = multi_headed.fit_epoch, []
 
-    def fit_blocks(state, setup, blocks, *, independent):
+    def fit_epoch(state, setup, data, **terms):
         rates.append(setup.config.learning_rate)
-        state, found = plain(state, setup, blocks, independent=independent)
+        state, found = plain(state, setup, data, **terms)
         if first <= len(rates) <= first + times - 1:
             return jax.tree.map(lambda x: x * 0, state), found._replace(skipped=found.updates)
         return state, found
 
-    monkeypatch.setattr(multi_headed, "fit_blocks", fit_blocks)
+    monkeypatch.setattr(multi_headed, "fit_epoch", fit_epoch)
     return rates
 
 
@@ -102,17 +102,17 @@ class Stopping(Listening):
 
 def fail_in_epoch(monkeypatch, *, at, above):
     """Let the epoch from the `at`-th update diverge, unless its step is small enough."""
-    plain, rates = multi_headed.fit_blocks, []
+    plain, rates = multi_headed.fit_epoch, []
 
-    def fit_blocks(state, setup, blocks, *, independent):
+    def fit_epoch(state, setup, data, **terms):
         rates.append(setup.config.learning_rate)
         begins = int(state.optimizer[0].count)
-        state, found = plain(state, setup, blocks, independent=independent)
+        state, found = plain(state, setup, data, **terms)
         if begins == at and rates[-1] > above:
             return jax.tree.map(lambda x: x * 0, state), found._replace(skipped=found.updates)
         return state, found
 
-    monkeypatch.setattr(multi_headed, "fit_blocks", fit_blocks)
+    monkeypatch.setattr(multi_headed, "fit_epoch", fit_epoch)
     return rates
 
 

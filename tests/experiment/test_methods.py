@@ -86,14 +86,6 @@ def test_unknown_environment_option_is_refused():
         make_config("cartpole-swingup", settings={"env_options": {"terminate_off_trak": True}})
 
 
-def test_blocks_must_hold_an_episode_of_the_environments_own_length():
-    assert make_config("hopper", settings={"fitting.block_transitions": 500})
-    with pytest.raises(ConfigError, match="block_transitions is 499, allowed: at least the 500"):
-        make_config("hopper", settings={"fitting.block_transitions": 499})
-    shorter = {"fitting.block_transitions": 499, "collection.episode_length": 499}
-    assert make_config("hopper", settings=shorter)
-
-
 @pytest.mark.parametrize("env", env_names())
 def test_test_episodes_are_fixed_distinct_and_spread_evenly(env):
     sets = env_spec(env).sim_params

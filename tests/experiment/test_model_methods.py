@@ -10,10 +10,8 @@ import headway
 import headway.envs
 from headway.data import Trajectory
 from headway.experiment import limits, loading, training
-from headway.experiment.blocks import BlockedData, Layout, fit_blocks
 from headway.experiment.methods import make_config, told_sim_params
-from headway.models.dynamics import Statistics, network_input
-from headway.models.fitting import FitSetup
+from headway.models.dynamics import network_input
 from headway.settings import differences
 
 NEW = ("stacked", "cadm", "pets-cadm", "oracle-params", "ria")
@@ -158,20 +156,19 @@ def fitted_error(method):
             "planner.num_particles": 1,
             "fitting.learning_rate": 5e-3,
             "fitting.batch_size": 64,
+            "fitting.epochs": 60,
             "collection.num_episodes": 30,
             "collection.episode_length": 30,
             "model.history_length": 5,
         },
     )
-    task, train, names = loading.load_task(config), masses(40), told_sim_params(config)
-    setup = FitSetup(task, config.fitting, 5)
-    statistics = Statistics.fit(task, train, 5, names)
-    key = jax.random.key(0)
-    data = BlockedData(train, Layout.of(config, 30), statistics, setup, 1, key)
-    state = loading.initial(config, task).fit
-    state, _ = fit_blocks(state, setup, data.stream(60, key), independent=True)
+    task = loading.load_task(config)
+    learner, learned = loading.learner_of(config, task), loading.initial(config, task)
+    fit = learner.fit(masses(40), 0, jax.random.key(0))
+    *_, (state, _) = fit.epochs(learned.fit, 0)
+    statistics = fit.statistics
     test = masses(4, seed=1)
-    episodes = Layout(4, 30, names).episodes(test)
+    episodes = learner.pad(test)
     row = jnp.repeat(jnp.arange(4), 25)[None]
     step = jnp.tile(jnp.arange(5, 30), 4)[None]
     past = episodes.history(row, step, 5)

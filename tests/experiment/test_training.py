@@ -1,6 +1,5 @@
 """The whole loop, at smoke size: every environment, repeatability, resuming, early endings."""
 
-import dataclasses
 import json
 from pathlib import Path
 
@@ -8,11 +7,10 @@ import numpy as np
 import pytest
 
 import headway
-from headway.errors import ConfigError, PlanningError, RunError, UnknownNameError
+from headway.errors import PlanningError, RunError, UnknownNameError
 from headway.experiment import loading, training
 from headway.experiment.methods import make_config
 from headway.storage import arrays
-from headway.storage.interrupts import StopRequest
 from headway.storage.run_dir import RunDir
 from headway.tasks.catalog import env_names
 from headway.training.progress import Progress
@@ -106,43 +104,6 @@ def test_interrupted_run_resumes_to_the_same_end(broken, reference, tmp_path, mo
     training.train_run(config, tmp_path / "cut")
     assert untimed(tmp_path / "cut") == untimed(reference)
     assert contents(tmp_path / "cut") == contents(reference)
-
-
-def test_a_run_in_blocks_resumes_to_the_same_end(reference, tmp_path, monkeypatch):
-    blocks = {**TINY, "fitting.block_transitions": 25, "collection.num_iterations": 3}
-    config = make_config("pendulum", preset="smoke", settings=blocks)
-    training.train_run(config, tmp_path / "whole")
-    interrupt(config, tmp_path / "cut", "evaluate", monkeypatch)
-    training.train_run(config, tmp_path / "cut")
-    assert untimed(tmp_path / "cut") == untimed(tmp_path / "whole")
-    assert contents(tmp_path / "cut") == contents(tmp_path / "whole")
-    # The first iteration is one block of the same data, though in smaller arrays.
-    data = "data/iteration-000.safetensors"
-    assert contents(tmp_path / "whole")[data] == contents(reference)[data]
-    updates = [line["fitting"]["updates"] for line in untimed(tmp_path / "whole")]
-    assert updates == [4, 2 * 4, 3 * 4]  # 2 x 50 samples in batches of 32, in 1, 2 and 3 blocks
-
-
-def test_a_run_goes_on_with_its_files_and_not_with_arrays(tmp_path):
-    config = make_config("pendulum", preset="smoke", settings=TINY)
-    asked = (config, RunDir(tmp_path / "run"), Progress(), StopRequest())
-    trainer = training.Trainer.open(*asked)
-    trainer.run_iteration(0)
-    again = training.Trainer.open(*asked)
-    for found in (trainer, again):
-        assert len(found.buffer) == 2
-        for trajectory in found.buffer.trajectories:
-            for array in (trajectory.obs, trajectory.action, trajectory.reward):
-                assert isinstance(array.base, np.memmap)
-                assert not array.flags.writeable
-
-
-def test_blocks_smaller_than_an_episode_are_refused_before_anything_is_written(tmp_path):
-    config = make_config("pendulum", preset="smoke", settings=TINY)
-    small = dataclasses.replace(config.fitting, block_transitions=11)
-    with pytest.raises(ConfigError, match=r"block_transitions is 11, allowed: at least the 12 st"):
-        training.train_run(dataclasses.replace(config, fitting=small), tmp_path / "run")
-    assert not (tmp_path / "run").exists()
 
 
 def test_finished_run_is_left_alone(reference):

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from headway.models.moments import Moments
 from headway.models.networks import (
     Dense,
     DenseHeads,
@@ -19,14 +18,9 @@ from headway.models.networks import (
 )
 
 
-def fit(values):
-    moments = Moments.of(values)
-    return Normalizer.of_moments(moments.mean, moments.std)
-
-
 def test_normalised_values_have_zero_mean_and_unit_variance():
     values = np.random.default_rng(0).normal(3.0, 2.0, (200, 3)).astype(np.float32)
-    normalizer = fit(values)
+    normalizer = Normalizer.fit(values)
     exact = values.astype(np.float64)
     np.testing.assert_allclose(normalizer.mean, exact.mean(0), rtol=1e-6)
     np.testing.assert_allclose(normalizer.std, exact.std(0), rtol=1e-6)
@@ -38,7 +32,7 @@ def test_normalised_values_have_zero_mean_and_unit_variance():
 @given(st.integers(0, 2**16), st.floats(-1e3, 1e3, width=32))
 def test_denormalise_undoes_normalise_where_the_feature_varies(seed, offset):
     values = (np.random.default_rng(seed).normal(size=(20, 2)) + offset).astype(np.float32)
-    normalizer = fit(values)
+    normalizer = Normalizer.fit(values)
     back = normalizer.denormalize(normalizer.normalize(jnp.asarray(values)))
     np.testing.assert_allclose(back, values, rtol=1e-5, atol=1e-5)
 
@@ -46,7 +40,7 @@ def test_denormalise_undoes_normalise_where_the_feature_varies(seed, offset):
 @pytest.mark.parametrize("constant", [0.0, 1.0, -3.7, 0.1, 1e6, 1e-20])
 def test_a_constant_feature_is_shifted_not_scaled_and_always_given_back(constant):
     values = np.full((1000, 1), constant, np.float32)
-    normalizer = fit(values)
+    normalizer = Normalizer.fit(values)
     assert float(normalizer.std[0]) == 0.0
     assert float(normalizer.scale[0]) == 1.0
     np.testing.assert_array_equal(normalizer.normalize(jnp.asarray(values)), 0.0)
@@ -55,7 +49,7 @@ def test_a_constant_feature_is_shifted_not_scaled_and_always_given_back(constant
 
 def test_a_feature_that_varies_little_about_zero_is_still_scaled():
     values = np.random.default_rng(0).normal(0, 1e-6, (100, 1)).astype(np.float32)
-    scaled = fit(values).normalize(jnp.asarray(values))
+    scaled = Normalizer.fit(values).normalize(jnp.asarray(values))
     assert 0.9 < float(scaled.std()) < 1.1
 
 

@@ -25,9 +25,6 @@ class FittingConfig:
     batch_size: int = 256
     """Samples per member and update. Gradient-adapted: transitions per update, half of them to
     adapt to. Recurrent: transitions per update, in whole episodes, at least one."""
-    block_transitions: int = 200_000
-    """Most transitions, padding counted, that are fitted as one block; larger data are gone
-    through block by block, in bounded memory. The paper's data are one block."""
     precision: Precision = "float32"
     """What the networks multiply while fitting, forwards and backwards. Sums, weights and Adam are
     always float32, and so are the first layers of the networks that predict. bfloat16 is faster
@@ -67,7 +64,7 @@ class FittingConfig:
     def __post_init__(self):
         problems = Problems(self)
         problems.at_least(1, "segment_length", "epochs", "batch_size", "future_length")
-        problems.at_least(1, "block_transitions", "backprop_steps")
+        problems.at_least(1, "backprop_steps")
         problems.at_least(
             0,
             "warmup_iterations",

@@ -1,7 +1,7 @@
 """What a trained model has learned: head shares per physics, error by imagined step."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.data import Episodes, Trajectory, sim_params_row
+from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitSetup, assign_segments
 from headway.planning.acting import Physics
 from headway.planning.agent import Agent, choose_heads, encode, planning_heads
@@ -23,27 +24,31 @@ NUM_STARTS = 256  # imagined rollouts per group in `prediction_error`
 
 
 def head_shares(
-    agent: Agent, setup: FitSetup, blocks: Iterable[tuple[list[Trajectory], Episodes]]
+    model: MultiHeadDynamics,
+    statistics: Statistics,
+    setup: FitSetup,
+    trajectories: list[Trajectory],
+    episodes: Episodes,
 ) -> list[dict[str, Any]]:
     """Share of the segments of each physics that each head of each member owns.
 
     Args:
-        agent: The agent as trained so far.
+        model: As trained so far.
+        statistics: Its normalisers.
         setup: Task and settings of fitting.
-        blocks: Trajectories and the same laid out, a block at a time.
+        trajectories: All data.
+        episodes: The same, laid out.
 
     Returns:
         Rows of `assignments.csv`, without the iteration.
     """
-    assign = eqx.filter_jit(assign_segments)
-    owned = defaultdict(lambda: np.zeros((agent.model.num_members, agent.model.num_heads)))
-    for trajectories, episodes in blocks:
-        heads = np.asarray(assign(agent.model, setup, episodes, agent.statistics).forward)
-        for row, trajectory in enumerate(trajectories):
-            used = -(-len(trajectory) // setup.segment_length)
-            for head in range(agent.model.num_heads):
-                count = (heads[:, row, :used] == head).sum(-1)
-                owned[format_sim_params(trajectory.sim_params)][:, head] += count
+    heads = np.asarray(eqx.filter_jit(assign_segments)(model, setup, episodes, statistics).forward)
+    owned = defaultdict(lambda: np.zeros((model.num_members, model.num_heads)))
+    for row, trajectory in enumerate(trajectories):
+        used = -(-len(trajectory) // setup.segment_length)
+        for head in range(model.num_heads):
+            count = (heads[:, row, :used] == head).sum(-1)
+            owned[format_sim_params(trajectory.sim_params)][:, head] += count
     return [
         {"member": member, "head": head, "sim_params": physics, "share": float(share)}
         for physics, counts in sorted(owned.items())

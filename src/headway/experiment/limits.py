@@ -8,7 +8,6 @@ import jax
 
 from headway.config import Config
 from headway.errors import LimitError
-from headway.experiment.blocks import Layout
 from headway.experiment.methods import told_sim_params
 from headway.models.dynamics import context_layer, context_size
 from headway.tasks.base import Task
@@ -38,7 +37,7 @@ class MemoryNeed(NamedTuple):
     model: int
     """Weights and Adam's moments, with the copies that an update and a checkpoint make."""
     data: int
-    """The blocks that are laid out at a time, and their tables of samples."""
+    """All episodes and the tables of their samples."""
     fitting: int
     """Shuffled samples of an epoch and the activations of a batch."""
     planning: int
@@ -76,14 +75,12 @@ def memory_need(config: Config, task: Task, episode_length: int) -> MemoryNeed:
         task: For the sizes of observations and actions.
         episode_length: Steps of an episode.
     """
-    collection, layout = config.collection, Layout.of(config, episode_length)
-    one_block = collection.num_iterations * collection.num_episodes <= layout.num_episodes
-    # Of several blocks, the next one is laid out while the device learns from the current one.
-    steps = layout.num_episodes * episode_length * (1 if one_block else 2)
+    collection = config.collection
+    steps = collection.num_iterations * collection.num_episodes * episode_length
     samples = steps * config.fitting.future_length
     members = config.model.num_members
     step = task.obs_size + task.action_size
-    # In mapped files, laid out in NumPy and once more on the device.
+    # As they were read, laid out in NumPy and once more on the device.
     episodes = steps * (3 * step * FLOAT + 8)
     # Number of the episode, anchor and offset: in rows, as a table, padded, on the device.
     table = samples * 4 * 3 * FLOAT

@@ -12,7 +12,7 @@ from headway.config.unused import unused_settings
 from headway.errors import ConfigError, unknown_name
 from headway.experiment.presets import PRESETS, Settings
 from headway.settings import TOLERANCE, flatten, override, setting_names, to_dict
-from headway.tasks.catalog import env_spec, episode_length, sim_param_sets
+from headway.tasks.catalog import env_spec, sim_param_sets
 
 
 @dataclasses.dataclass(frozen=True)
@@ -240,7 +240,6 @@ def make_config(
     start = Config(env=spec.name, method=method, preset=preset)
     config = override(start, {**named, "seed": seed, **(settings or {})})
     check_options(config)
-    check_block(config)
     return config
 
 
@@ -307,17 +306,3 @@ def check_options(config: Config) -> None:
     for option in config.env_options:
         if option not in spec.options:
             raise ConfigError(str(unknown_name(f"{spec.name} option", option, spec.options)))
-
-
-def check_block(config: Config) -> None:
-    """Refuse blocks that do not hold one whole episode.
-
-    Raises:
-        ConfigError: `fitting.block_transitions` is too small.
-    """
-    length = episode_length(config)
-    if config.fitting.block_transitions < length:
-        raise ConfigError(
-            f"fitting.block_transitions is {config.fitting.block_transitions}, allowed: at least"
-            f" the {length} steps of an episode; raise it or lower collection.episode_length."
-        )

@@ -19,7 +19,6 @@ from headway.experiment.evaluation import Tests, episode_rows, evaluate_agent, t
 from headway.experiment.learners import Fit, Learned, Learner, make_learner
 from headway.experiment.limits import check_memory, make_room_for_programs
 from headway.experiment.loading import initial, load_learned, need_of
-from headway.experiment.methods import check_block
 from headway.experiment.resumable import (
     fit_part,
     fitted_before,
@@ -198,15 +197,10 @@ class Trainer:
         bad = BadEpisodes("collection.max_bad_episodes", allowed, say, self.store.drop)
         bad.leave_out("collect", list(rollout.broken.values()))
         bad.want_some(len(rollout.trajectories))
-        return self.keep(iteration, rollout.trajectories), rollout.use.failures
-
-    def keep(self, iteration: int, collected: list[Trajectory]) -> list[Trajectory]:
-        """Write what was collected, and go on with the files instead of the arrays."""
-        self.run.save_data(iteration, collected)
-        mapped = self.run.iteration_data(iteration)
-        for trajectory in mapped:
+        self.run.save_data(iteration, rollout.trajectories)
+        for trajectory in rollout.trajectories:
             self.buffer.add(trajectory)
-        return mapped
+        return rollout.trajectories, rollout.use.failures
 
     def fit(self, iteration: int, key: PRNGKeyArray) -> dict[str, Any]:
         """Renew the statistics and go through the data `epochs` times.
@@ -335,7 +329,6 @@ def train_run(
         LimitError: The run needs more memory than is free.
         RunError: The directory holds something else, is damaged, or in use.
     """
-    check_block(config)
     run = RunDir(run_dir)
     make_room_for_programs()
     if not ignore_limits:

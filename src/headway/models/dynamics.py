@@ -14,10 +14,8 @@ from headway.data import (
     History,
     Trajectory,
     history_action_moments,
-    parts_of,
     sim_params_row,
 )
-from headway.models.moments import Moments, merge_columns
 from headway.models.networks import (
     Dense,
     DenseHeads,
@@ -29,8 +27,6 @@ from headway.models.networks import (
 )
 from headway.models.products import row_by_row
 from headway.tasks.base import Task
-
-PART_TRANSITIONS = 2**17  # read at once for statistics; the paper's whole data are one part
 
 
 class Prediction(NamedTuple):
@@ -223,7 +219,7 @@ class Statistics(eqx.Module):
     ) -> "Statistics":
         """Recompute from all data so far, as at the start of every iteration.
 
-        The data are read once, in parts of `PART_TRANSITIONS`, and never held together.
+        A simulator parameter that never varied is shifted to 0 and not scaled.
 
         Args:
             task: How observations enter and leave the model.
@@ -231,36 +227,20 @@ class Statistics(eqx.Module):
             history_length: Past transitions that a context is made of (K).
             sim_param_names: Simulator parameters that the model is told.
         """
-        parts = parts_of(trajectories, PART_TRANSITIONS)
-        found = merge_columns(transition_moments(task, part) for part in parts)
-        features, action, delta, backward = (Normalizer.of_moments(m.mean, m.std) for m in found)
-        history = Normalizer.of_moments(*history_action_moments(trajectories, history_length))
-        physics = fit_sim_params(trajectories, sim_param_names) if sim_param_names else None
-        return cls(features, action, delta, backward, history, physics)
-
-
-def fit_sim_params(trajectories: list[Trajectory], names: tuple[str, ...]) -> Normalizer:
-    """Mean and standard deviation of simulator parameters over all transitions.
-
-    A parameter that never varied is shifted to 0 and not scaled.
-    """
-    rows = np.stack([sim_params_row(t.sim_params, names) for t in trajectories])
-    moments = Moments.of(np.repeat(rows, [len(t) for t in trajectories], axis=0))
-    return Normalizer.of_moments(moments.mean, moments.std)
-
-
-def transition_moments(
-    task: Task, trajectories: list[Trajectory]
-) -> tuple[Moments, Moments, Moments, Moments]:
-    """Moments of the features, actions, targets and backward targets of some transitions."""
-    obs = jnp.asarray(np.concatenate([t.obs[:-1] for t in trajectories]))
-    next_obs = jnp.asarray(np.concatenate([t.obs[1:] for t in trajectories]))
-    return (
-        Moments.of(np.asarray(task.preprocess(obs))),
-        Moments.of(np.concatenate([t.action for t in trajectories])),
-        Moments.of(np.asarray(task.target(obs, next_obs))),
-        Moments.of(np.asarray(task.target(next_obs, obs))),
-    )
+        obs = jnp.asarray(np.concatenate([t.obs[:-1] for t in trajectories]))
+        next_obs = jnp.asarray(np.concatenate([t.obs[1:] for t in trajectories]))
+        told = None
+        if sim_param_names:
+            rows = np.stack([sim_params_row(t.sim_params, sim_param_names) for t in trajectories])
+            told = Normalizer.fit(np.repeat(rows, [len(t) for t in trajectories], axis=0))
+        return cls(
+            Normalizer.fit(np.asarray(task.preprocess(obs))),
+            Normalizer.fit(np.concatenate([t.action for t in trajectories])),
+            Normalizer.fit(np.asarray(task.target(obs, next_obs))),
+            Normalizer.fit(np.asarray(task.target(next_obs, obs))),
+            Normalizer.of_moments(*history_action_moments(trajectories, history_length)),
+            told,
+        )
 
 
 class MultiHeadDynamics(eqx.Module):

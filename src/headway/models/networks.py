@@ -36,6 +36,12 @@ class Normalizer(eqx.Module):
         return cls(jnp.zeros(size), jnp.ones(size))
 
     @classmethod
+    def fit(cls, values: Float[np.ndarray, "count size"]) -> "Normalizer":
+        """Take mean and standard deviation of values, in float64."""
+        values = np.asarray(values, np.float64)
+        return cls.of_moments(values.mean(0), values.std(0))
+
+    @classmethod
     def of_moments(cls, mean: np.ndarray, std: np.ndarray) -> "Normalizer":
         """Build from moments computed in float64; what float32 can't resolve is constant."""
         constant = std <= 1e-5 * np.maximum(np.abs(mean), 1e-12)

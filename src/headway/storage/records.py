@@ -12,9 +12,8 @@ import numpy as np
 from headway.data import Trajectory
 from headway.errors import HeadwayError, RunError
 from headway.storage import files
-from headway.storage.arrays import Arrays, save_arrays
+from headway.storage.arrays import Arrays, load_arrays, save_arrays
 from headway.storage.files import damaged
-from headway.storage.mapped import map_arrays
 
 Facts = list[dict[str, Any]]
 
@@ -147,11 +146,11 @@ def save_trajectories(path: Path, trajectories: Sequence[Trajectory]) -> None:
 
 
 def load_trajectories(path: Path) -> list[Trajectory]:
-    """Open what `save_trajectories` wrote; the arrays are read-only views of the mapped file.
+    """Read what `save_trajectories` wrote.
 
     Raises:
         RunError: A file is missing or damaged.
     """
-    arrays = map_arrays(path.with_suffix(".safetensors"))
+    arrays = load_arrays(path.with_suffix(".safetensors"))
     facts = files.read_json(path.with_suffix(".json"))
     return trajectories_from(arrays, facts, path)

@@ -1,22 +1,20 @@
 """Models that change while they act: GrBAL's and ReBAL's."""
 
 import abc
-import itertools
 from collections.abc import Sequence
-from contextlib import closing
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from headway.data import Trajectory
-from headway.experiment.blocks import BlockedData, Layout, fit_each
 from headway.experiment.diagnostics import imagined_error
 from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
 from headway.experiment.rollouts import Arena
 from headway.models.adapted import MetaSetup, ReluNet, meta_epoch
 from headway.models.dynamics import Statistics
-from headway.models.fitting import FitData, FitSetup
+from headway.models.fitting import FitData
 from headway.models.recurrent import RecurrentNet, RecurrentSetup, recurrent_epoch
 from headway.models.updates import EpochStats, Fitted
 from headway.planning.meta.agent import AdaptiveAgent, imagine
@@ -31,10 +29,10 @@ class Adaptive(Learner):
         """Initial weights."""
 
     @abc.abstractmethod
-    def fit_block(
+    def fit_epoch(
         self, state: Fitted, data: FitData, key: PRNGKeyArray
     ) -> tuple[Fitted, EpochStats]:
-        """Go once through a block of data."""
+        """Go once through the data."""
 
     @abc.abstractmethod
     def acting_model(self, learned: Learned) -> AdaptiveModel:
@@ -53,18 +51,13 @@ class Adaptive(Learner):
     def fit(self, trajectories: list[Trajectory], iteration: int, key: PRNGKeyArray) -> Fit:
         """See `Learner.fit`."""
         del iteration
-        fitting, history_length = self.config.fitting, self.config.model.history_length
-        statistics = Statistics.fit(self.task, trajectories, history_length)
-        layout = Layout.of(self.config, self.episode_length)
-        setup = FitSetup(self.task, fitting, history_length)
-        data = BlockedData(trajectories, layout, statistics, setup, num_members=1, key=key)
+        statistics = Statistics.fit(self.task, trajectories, self.config.model.history_length)
+        data = self.lay_out(trajectories, statistics, num_members=1, key=key)
 
         def epochs(state: Fitted, first: int) -> Epochs:
-            with closing(data.stream(fitting.epochs, key, first=first)) as blocks:
-                for _ in range(first, fitting.epochs):
-                    of_epoch = itertools.islice(blocks, data.num_blocks)
-                    state, stats = fit_each(state, of_epoch, self.fit_block)
-                    yield state, stats
+            for epoch in range(first, self.config.fitting.epochs):
+                state, stats = self.fit_epoch(state, data, jax.random.fold_in(key, epoch))
+                yield state, jax.device_get(stats)
 
         return Fit(statistics, epochs)
 
@@ -117,10 +110,10 @@ class GradientAdaptation(Adaptive):
         """See `Adaptive.draw_net`."""
         return ReluNet.init(self.config.model, self.task, key=key)
 
-    def fit_block(
+    def fit_epoch(
         self, state: Fitted, data: FitData, key: PRNGKeyArray
     ) -> tuple[Fitted, EpochStats]:
-        """See `Adaptive.fit_block`."""
+        """See `Adaptive.fit_epoch`."""
         return meta_epoch(state, self.setup, data, key=key)
 
     def acting_model(self, learned: Learned) -> GradientAdapted:
@@ -143,10 +136,10 @@ class Recurrence(Adaptive):
         """See `Adaptive.draw_net`."""
         return RecurrentNet.init(self.config.model, self.task, key=key)
 
-    def fit_block(
+    def fit_epoch(
         self, state: Fitted, data: FitData, key: PRNGKeyArray
     ) -> tuple[Fitted, EpochStats]:
-        """See `Adaptive.fit_block`."""
+        """See `Adaptive.fit_epoch`."""
         setup = RecurrentSetup(self.task, self.config.fitting)
         return recurrent_epoch(state, setup, data, key=key)
 

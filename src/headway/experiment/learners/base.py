@@ -8,8 +8,11 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from headway.config import Config
-from headway.data import Trajectory
+from headway.data import Episodes, Samples, Trajectory
+from headway.experiment.methods import told_sim_params
 from headway.experiment.rollouts import Arena
+from headway.models.dynamics import Statistics
+from headway.models.fitting import FitData, make_data
 from headway.models.updates import EpochStats
 from headway.planning.acting import Acting
 from headway.settings import override
@@ -76,6 +79,37 @@ class Learner(abc.ABC):
             arena: Where it acts, if that is known; only the simulator asks.
             trajectories: What it was learned from; only heads that keep learning ask.
         """
+
+    def pad(self, trajectories: list[Trajectory]) -> Episodes:
+        """Lay all data out, padded to their size at the end of the run: compiled once."""
+        collection, names = self.config.collection, told_sim_params(self.config)
+        of_run = collection.num_iterations * collection.num_episodes
+        capacity = max(of_run, len(trajectories))
+        return Episodes.pad(trajectories, capacity, self.episode_length, names)
+
+    def lay_out(
+        self,
+        trajectories: list[Trajectory],
+        statistics: Statistics,
+        num_members: int,
+        key: PRNGKeyArray,
+    ) -> FitData:
+        """Bring together what an epoch reads.
+
+        Args:
+            trajectories: All data so far.
+            statistics: Normalisers fitted to them.
+            num_members: Networks in the ensemble.
+            key: Draws the bootstrap samples.
+        """
+        fitting, episodes = self.config.fitting, self.pad(trajectories)
+        samples = Samples.table(
+            [len(trajectory) for trajectory in trajectories],
+            fitting.future_length,
+            capacity=episodes.action[..., 0].size * fitting.future_length,
+            drop_first=fitting.drop_first_anchor,
+        )
+        return make_data(episodes, samples, statistics, fitting, num_members=num_members, key=key)
 
     def slower(self, factor: float) -> Self:
         """The same, but learning with smaller steps."""

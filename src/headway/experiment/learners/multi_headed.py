@@ -1,9 +1,7 @@
 """Ensembles of multi-headed networks: T-MCL and all that is expressed by its settings."""
 
 import dataclasses
-import itertools
 from collections.abc import Iterable, Sequence
-from contextlib import closing
 from typing import Any
 
 import jax
@@ -11,29 +9,23 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from headway.data import Episodes, Trajectory
-from headway.experiment.blocks import BlockedData, Layout, fit_blocks
 from headway.experiment.diagnostics import head_shares, prediction_error
 from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
 from headway.experiment.methods import told_sim_params
 from headway.experiment.rollouts import Arena
 from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.models.fitting import FitSetup, FitState, episode_losses
+from headway.models.fitting import FitSetup, FitState, episode_losses, fit_epoch
 from headway.planning.agent import Agent
 from headway.planning.last_layer.prior import fit_prior
 
 
 class MultiHeaded(Learner):
-    """`MultiHeadDynamics`, fitted block by block; heads are chosen while acting."""
+    """`MultiHeadDynamics`; heads are chosen while acting."""
 
     @property
     def setup(self) -> FitSetup:
         """What fixes the compiled epoch."""
         return FitSetup(self.task, self.config.fitting, self.config.model.history_length)
-
-    @property
-    def layout(self) -> Layout:
-        """Sizes of a block."""
-        return Layout.of(self.config, self.episode_length)
 
     def initial(self, key: PRNGKeyArray) -> Learned:
         """See `Learner.initial`."""
@@ -46,11 +38,9 @@ class MultiHeaded(Learner):
         """See `Learner.fit`."""
         model, fitting = self.config.model, self.config.fitting
         data_key, epoch_key = jax.random.split(key)
-        names = self.layout.sim_param_names
+        names = told_sim_params(self.config)
         statistics = Statistics.fit(self.task, trajectories, model.history_length, names)
-        data = BlockedData(
-            trajectories, self.layout, statistics, self.setup, model.num_members, data_key
-        )
+        data = self.lay_out(trajectories, statistics, model.num_members, data_key)
         independent = (
             iteration < fitting.warmup_iterations
             or fitting.oracle == "independent"
@@ -58,11 +48,10 @@ class MultiHeaded(Learner):
         )
 
         def epochs(state: FitState, first: int) -> Epochs:
-            with closing(data.stream(fitting.epochs, epoch_key, first=first)) as blocks:
-                for _ in range(first, fitting.epochs):
-                    of_epoch = itertools.islice(blocks, data.num_blocks)
-                    state, stats = fit_blocks(state, self.setup, of_epoch, independent=independent)
-                    yield state, stats
+            for epoch in range(first, fitting.epochs):
+                key = jax.random.fold_in(epoch_key, epoch)
+                state, stats = fit_epoch(state, self.setup, data, independent=independent, key=key)
+                yield state, jax.device_get(stats)
 
         return Fit(statistics, epochs)
 
@@ -98,7 +87,7 @@ class MultiHeaded(Learner):
         self, learned: Learned, trajectories: list[Trajectory]
     ) -> Iterable[Float[np.ndarray, "member head time"]]:
         """See `Learner.head_losses`; one trajectory at a time."""
-        names = self.layout.sim_param_names
+        names = told_sim_params(self.config)
         for trajectory in trajectories:
             episode = Episodes.pad([trajectory], 1, self.episode_length, names)
             losses = episode_losses(learned.fit.model, self.setup, episode, 0, learned.statistics)
@@ -108,7 +97,8 @@ class MultiHeaded(Learner):
         self, learned: Learned, trajectories: list[Trajectory]
     ) -> Sequence[dict[str, Any]]:
         """See `Learner.head_shares`."""
-        return head_shares(self.frozen(learned), self.setup, self.layout.in_order(trajectories))
+        model, statistics, episodes = learned.fit.model, learned.statistics, self.pad(trajectories)
+        return head_shares(model, statistics, self.setup, trajectories, episodes)
 
     def prediction_error(
         self, learned: Learned, trajectories: list[Trajectory], key: PRNGKeyArray
