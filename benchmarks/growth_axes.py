@@ -9,11 +9,9 @@ from workloads import EPISODE_LENGTH, make_agent, make_fit, make_trajectories
 
 from headway.config import FittingConfig, ModelConfig, PlannerConfig
 from headway.data import Episodes, Samples
-from headway.models.compilation import compiler_options, jit_networks
+from headway.models.compilation import jit_networks
 from headway.models.dynamics import Statistics
-from headway.models.fitting import assign_segments, fit_epoch, make_data, one_epoch
-from headway.models.meeting import Program, in_groups, stack
-from headway.planning.search import act_in_one
+from headway.models.fitting import assign_segments, fit_epoch, make_data
 from headway.tasks.catalog import env_spec
 
 MODEL = ModelConfig(
@@ -61,26 +59,6 @@ def epoch(transitions: int = 10_000, members: int = MODEL.num_members) -> Work:
     return lambda: fit_epoch(state, setup, data, independent=False, key=key)
 
 
-def plan_of_seeds(seeds: int) -> Work:
-    """One plan of every seed, as seeds that are trained together are computed."""
-    agent, state, obs = make_agent(NUM_ENVS, MODEL, PLANNER)
-    return _over_seeds(act_in_one, seeds, (agent, state, obs), {})
-
-
-def epoch_of_seeds(seeds: int) -> Work:
-    """One epoch of every seed, likewise."""
-    state, setup, data = make_fit(5, 5, MODEL, FITTING)
-    named = {"independent": False, "key": jax.random.key(2)}
-    return _over_seeds(one_epoch, seeds, (state, setup, data), named)
-
-
-def _over_seeds(function: Callable, seeds: int, *arguments: Any) -> Work:
-    """A function of arguments that all seeds have, mapped over each group of seeds."""
-    groups = [stack(group) for group in in_groups([arguments] * seeds)]
-    program = Program(function, lambda: {"compiler_options": compiler_options()})
-    return lambda: [program.together(group) for group in groups]
-
-
 def assignment(transitions: int) -> Work:
     """The winning head of every segment of a data set."""
     episodes = transitions // EPISODE_LENGTH
@@ -110,7 +88,6 @@ def preparation(transitions: int) -> Work:
 
 _TRANSITIONS = (1_000, 10_000, 30_000, 100_000, 300_000, 1_000_000)
 _MEMBERS = (1, 2, 4, 6, 8, 10)
-_SEEDS = (1, 2, 4, 8, 16)
 
 AXES = {
     axis.name: axis
@@ -126,8 +103,6 @@ AXES = {
         Axis("horizon", "plan", "steps", (5, 10, 20, 30, 40, 60), lambda size: plan(horizon=size)),
         Axis("members", "plan", "members", _MEMBERS, plan_of_members),
         Axis("members-epoch", "epoch", "members", _MEMBERS, lambda size: epoch(members=size)),
-        Axis("seeds", "plan", "seeds", _SEEDS, plan_of_seeds),
-        Axis("seeds-epoch", "epoch", "seeds", _SEEDS, epoch_of_seeds),
         Axis("data-epoch", "epoch", "transitions", _TRANSITIONS, epoch),
         Axis("data-assignment", "head assignment", "transitions", _TRANSITIONS, assignment),
         Axis("data-preparation", "preparing data", "transitions", _TRANSITIONS, preparation),

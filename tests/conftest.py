@@ -16,6 +16,7 @@ import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
 from headway.experiment.limits import resident  # noqa: E402
+from headway.models.compilation import prepare_jax  # noqa: E402
 
 settings.register_profile(
     "headway",
@@ -26,6 +27,7 @@ settings.register_profile(
 )
 settings.load_profile("headway")
 
+prepare_jax()
 MUCH = 3 * 2**30  # bytes
 
 

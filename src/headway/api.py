@@ -10,6 +10,7 @@ from headway.experiment.evaluation import PlanningCost, episode_rows
 from headway.experiment.methods import make_config
 from headway.experiment.testing import run_tests
 from headway.experiment.training import train_run
+from headway.models.compilation import prepare_jax
 from headway.planning.controller import Controller
 from headway.report.figures import save_run_figures
 from headway.service import load
@@ -117,6 +118,7 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
         BadEnvironmentError: The environment broke its contract.
         DivergenceError: Fitting lost all finite numbers.
     """
+    prepare_jax()
     config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
     run = train_run(
         config,
@@ -153,6 +155,7 @@ def evaluate(
             training has fixed.
         LimitError: Planning needs more memory than is free.
     """
+    prepare_jax()
     tested = run_tests(
         run_dir, groups=groups, num_episodes=num_episodes, settings=settings, progress=progress
     )

@@ -607,7 +607,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     stopped, code = "", 1
     try:
-        code = parse(words).run(words)
+        command = parse(words)
+        if not isinstance(command, List):
+            from headway.models.compilation import prepare_jax
+
+            prepare_jax()
+        code = command.run(words)
         sys.stdout.flush()
         return code
     except HeadwayError as error:

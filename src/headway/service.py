@@ -6,6 +6,7 @@ from typing import Any
 
 from headway.experiment.loading import load_agent
 from headway.experiment.methods import config_to_control
+from headway.models.compilation import prepare_jax
 from headway.planning.controller import Controller
 from headway.storage.run_dir import RunDir
 
@@ -32,6 +33,7 @@ def load(
             planner's; or as `Controller`.
         LimitError: The model needs more memory than is free.
     """
+    prepare_jax()
     run = RunDir(run_dir)
     config = config_to_control(run.config(), settings or {})
     return Controller(load_agent(run, config), seed=seed, **options)

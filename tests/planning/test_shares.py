@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import toys
-from headway.models.meeting import Meeting
 from headway.planning import returns, search, shares
 from headway.planning.deadline import DeadlinePlanner
 from headway.planning.imagination import ImaginedDynamics
@@ -137,8 +136,6 @@ def test_into_how_many_shares_a_plan_is_divided(monkeypatch):
     monkeypatch.setattr(shares, "num_cpus", lambda: 4)
     monkeypatch.setattr(shares, "LEAST", steps)
     assert [num_shares(TINY, num_envs) for num_envs in (1, 2, 3, 4, 5, 100)] == [1, 2, 3, 4, 4, 4]
-    with Meeting() as meeting, meeting.take_seat():
-        assert num_shares(TINY, 3) == 1
     monkeypatch.setattr(jax, "device_count", lambda: 2)
     assert num_shares(TINY, 3) == 1
 

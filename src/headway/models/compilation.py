@@ -1,16 +1,20 @@
-"""How functions that run the networks are compiled, and where compiled ones are kept."""
+"""JAX's settings for a run, and the compiler options of functions that run the networks."""
 
 import functools
 import os
+import threading
 import typing
+import warnings
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import platformdirs
 
 from headway.config import Precision
-from headway.models.meeting import Program, seat_here
+from headway.errors import ConfigError
 
 # Found by measuring on CPUs (docs/performance.md): full-width vectors make the activations
 # faster, and YNNPACK's fusions slow float32 products down but are the only way to fast
@@ -25,13 +29,59 @@ _JAX_KEEPS, _KEPT = 1.0, 0.05
 """Seconds that a program must take to compile to be kept: JAX's default, and ours."""
 
 
+def prepare_jax() -> None:
+    """Set JAX up for a run, before its first compilation; a second call changes nothing.
+
+    Turns on the persistent compilation cache in the user's cache folder, unless the user chose
+    another with `JAX_COMPILATION_CACHE_DIR` or turned it off with
+    `JAX_ENABLE_COMPILATION_CACHE=0`. Programs that take 0.05 s to compile are kept, because a plan
+    is several of them and JAX would keep none; `JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS` says
+    otherwise. `headway.train`, `load`, `evaluate` and the command line call this; importing
+    Headway changes nothing.
+
+    Raises:
+        ConfigError: JAX is in 64-bit mode.
+    """
+    settings: Any = jax.config  # JAX declares its settings while running
+    if settings.jax_enable_x64:
+        raise ConfigError(
+            "JAX is in 64-bit mode, allowed: 32-bit mode, in which the models are trained; unset"
+            " JAX_ENABLE_X64 or give a process of its own to what needs it."
+        )
+    if not settings.jax_enable_compilation_cache:
+        return
+    if settings.jax_compilation_cache_dir is None:
+        folder = platformdirs.user_cache_path("headway", appauthor=False) / "compiled"
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+    name = "jax_persistent_cache_min_compile_time_secs"
+    folder, kept_from = settings.jax_compilation_cache_dir, getattr(settings, name)
+    if not _can_write(folder):
+        if kept_from != float("inf"):
+            warnings.warn(
+                f"compiled programs cannot be kept in {folder}, so every process compiles again;"
+                " set JAX_COMPILATION_CACHE_DIR to a folder that can be written.",
+                stacklevel=3,
+            )
+        # JAX would warn once for every program; what is there is read all the same.
+        jax.config.update(name, float("inf"))
+        jax.config.update("jax_enable_compilation_cache", Path(folder).is_dir())
+    elif kept_from == _JAX_KEEPS and name.upper() not in os.environ:
+        jax.config.update(name, _KEPT)
+
+
+def _can_write(folder: str) -> bool:
+    if "://" in folder:  # in a cloud
+        return True
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK | os.X_OK)
+
+
 @functools.cache
 def compiler_options(precision: Precision = "float32") -> dict[str, Any]:
-    """The compiler options for products of a precision, without those this XLA does not know.
-
-    Args:
-        precision: `float32` or `bfloat16`.
-    """
+    """Options for products of a precision, without those that this XLA does not know."""
     options: dict[str, Any] = {}
     if jax.default_backend() != "cpu":
         return options
@@ -47,17 +97,18 @@ def compiler_options(precision: Precision = "float32") -> dict[str, Any]:
 def jit_networks(function: Callable, *, precision: Precision = "float32") -> Callable:
     """`equinox.filter_jit` with the compiler options for many small products.
 
-    The function is wrapped when first called, so that importing stays light. In a run that goes
-    side by side with others, it is called for all of them at once (`models.meeting`).
+    The function is wrapped when first called, so that importing does not start JAX's backend.
     """
-    program = Program(function, lambda: {"compiler_options": compiler_options(precision)})
+    lock, compiled = threading.Lock(), None
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        seat = seat_here()
-        if seat is None:
-            return program.alone(*args, **kwargs)
-        return seat.compute(program, args, kwargs)
+        nonlocal compiled
+        with lock:  # several threads plan
+            if compiled is None:
+                options: Any = {"compiler_options": compiler_options(precision)}
+                compiled = eqx.filter_jit(function, **options)
+        return compiled(*args, **kwargs)
 
     return call
 
@@ -66,24 +117,3 @@ def in_each_precision(function: Callable) -> dict[Precision, Callable]:
     """A function that runs the networks, compiled for products of each precision."""
     precisions: tuple[Precision, ...] = typing.get_args(Precision)
     return {one: jit_networks(function, precision=one) for one in precisions}
-
-
-def keep_compilations() -> None:
-    """Turn on JAX's persistent compilation cache, unless the user has chosen a folder.
-
-    It lies in the user's cache folder; `JAX_COMPILATION_CACHE_DIR` moves it and
-    `JAX_ENABLE_COMPILATION_CACHE=0` turns it off. JAX looks once, at its first compilation:
-    that is why this runs on import. A step is several programs, none of which takes the second
-    to compile from which JAX would keep them, so all programs of 0.05 s are kept, in any folder,
-    unless `JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS` says otherwise.
-    """
-    settings: Any = jax.config  # JAX declares its settings while running
-    if settings.jax_compilation_cache_dir is None:
-        folder = platformdirs.user_cache_path("headway", appauthor=False) / "compiled"
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-    name = "jax_persistent_cache_min_compile_time_secs"
-    if getattr(settings, name) == _JAX_KEEPS and name.upper() not in os.environ:
-        jax.config.update(name, _KEPT)
-
-
-keep_compilations()

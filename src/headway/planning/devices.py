@@ -10,8 +10,6 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 
-from headway.models.meeting import seeds_at_once
-
 Tree = TypeVar("Tree")
 
 CPU_BUDGET = 4 * 2**20
@@ -27,14 +25,14 @@ def environments_at_once(num_envs: int, bytes_per_env: int, budget: int | None =
 
     Args:
         num_envs: Environments in all.
-        bytes_per_env: Size of one environment's widest array of activations, for one seed.
+        bytes_per_env: Size of one environment's widest array of activations.
         budget: Bytes that all of them may take together; None for the `activation_budget`.
 
     Returns:
         At least 1; the environments are spread evenly over the fewest chunks that fit.
     """
     budget = activation_budget() if budget is None else budget
-    fitting = max(1, budget // (bytes_per_env * seeds_at_once()))
+    fitting = max(1, budget // bytes_per_env)
     chunks = -(-num_envs // fitting)
     return -(-num_envs // chunks)
 

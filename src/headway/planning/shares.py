@@ -18,7 +18,6 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from headway.config import PlannerConfig
 from headway.cpus import num_cpus
 from headway.models.compilation import in_each_precision
-from headway.models.meeting import seat_here
 from headway.planning.returns import Dynamics, RolloutSettings, Share, candidate_returns
 from headway.tasks.base import Task
 
@@ -29,14 +28,14 @@ LEAST = 5_000
 def num_shares(planner: PlannerConfig, num_envs: int) -> int:
     """Into how many shares the candidates of a plan are divided; 1 where they are not.
 
-    They are on a CPU that is one device, in a run by itself: where JAX has several devices, these
-    share the candidates (`devices.spread_candidates`), and runs that meet share the cores.
+    They are on a CPU that is one device: where JAX has several devices, these share the candidates
+    (`devices.spread_candidates`).
 
     Args:
         planner: Settings of the planner.
         num_envs: Environments that are planned for.
     """
-    if seat_here() is not None or jax.default_backend() != "cpu" or jax.device_count() > 1:
+    if jax.default_backend() != "cpu" or jax.device_count() > 1:
         return 1
     steps = num_envs * planner.num_candidates * planner.num_particles * planner.horizon
     return max(1, min(num_cpus(), steps // LEAST))

@@ -8,6 +8,7 @@ from importlib.util import find_spec
 
 from headway.errors import BusyError, ConfigError
 from headway.experiment.training import train_run
+from headway.models.compilation import prepare_jax
 from headway.sweeps.board import Board, first_status
 from headway.sweeps.jobs import Job
 from headway.sweeps.status import Status, StatusProgress, Tell, reason
@@ -120,6 +121,7 @@ def make_run(job: Job, tell: Tell) -> Status:
         tell(status)
 
     try:
+        prepare_jax()
         if not job.finished:
             train_run(job.config, job.path, StatusProgress(note, job.finished_iterations))
         done = Status("done", job.num_iterations, returns=reached.returns)
