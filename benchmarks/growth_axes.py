@@ -12,7 +12,7 @@ from headway.data import Episodes, Samples
 from headway.models.compilation import jit_networks
 from headway.models.dynamics import Statistics
 from headway.models.fitting import assign_segments, fit_epoch, make_data
-from headway.tasks.catalog import env_spec
+from headway.task import env_spec
 
 MODEL = ModelConfig(
     num_members=2, hidden_sizes=(64, 64), context_hidden_sizes=(32,), backward_net=False

@@ -11,8 +11,7 @@ from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitData, FitSetup, FitState, make_data
 from headway.planning.agent import Agent, AgentState
 from headway.planning.last_layer.regression import Prior
-from headway.tasks.base import Task
-from headway.tasks.catalog import env_spec
+from headway.task import Task, env_spec
 
 EPISODE_LENGTH = 200
 

@@ -132,7 +132,7 @@ MODULE = """HloModule jit_step
 
 FileNames
 1 "/site-packages/somewhere.py"
-2 "/src/headway/tasks/locomotion.py"
+2 "/src/headway/envs/locomotion.py"
 
 FunctionNames
 1 "helper"

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import headway
+from headway import task
 from headway.cli import main
 from headway.config import model
 from headway.errors import ConfigError
@@ -18,7 +19,6 @@ from headway.experiment import learners, methods
 from headway.experiment.loading import load_agent
 from headway.settings import setting_names
 from headway.storage.run_dir import RunDir
-from headway.tasks import catalog
 
 ROOT = Path(__file__).parent.parent
 
@@ -42,7 +42,7 @@ def guide(tmp_path_factory):
     package, script = python_blocks("docs/own-environment.md")
     names: dict = {}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(catalog, "_SPECS", dict(catalog._SPECS))
+        patch.setattr(task, "_registered", dict(task._registered))
         patch.chdir(tmp_path_factory.mktemp("guide"))
         exec(compile(package, "my_package.py", "exec"), names)
         patch.setitem(sys.modules, "my_package", types.ModuleType("my_package"))

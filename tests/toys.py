@@ -10,7 +10,7 @@ from headway.config import ModelConfig
 from headway.data import Episodes, Samples, Trajectory
 from headway.models.dynamics import GaussianNet, MultiHeadDynamics, Statistics
 from headway.models.networks import Dense, DenseHeads
-from headway.tasks.base import Task
+from headway.task import Task
 
 
 class PointTask(Task):

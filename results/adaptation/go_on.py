@@ -22,7 +22,7 @@ from headway.storage import arrays, config_file, files
 from headway.storage.iterations import checkpoint_name, manifest_name
 from headway.storage.manifest import Digest, Manifest
 from headway.storage.run_dir import RunDir
-from headway.tasks.catalog import episode_length
+from headway.task import episode_length
 
 
 def copy_but_last_fit(old: RunDir, new: Path, config: Config) -> None:

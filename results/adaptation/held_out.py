@@ -29,7 +29,7 @@ from headway.planning.last_layer.regression import see_episode
 from headway.settings import override
 from headway.storage.records import write_csv
 from headway.storage.run_dir import RunDir
-from headway.tasks.catalog import episode_length
+from headway.task import episode_length
 
 MOMENTS = (1, 3, 10, 30, 100)
 """Transitions that are learned from before the next are predicted."""

@@ -32,7 +32,7 @@ from headway.planning.last_layer.evidence import Evidence
 from headway.planning.last_layer.regression import Seen, see_episode
 from headway.storage.records import write_csv
 from headway.storage.run_dir import RunDir
-from headway.tasks.base import Task
+from headway.task import Task
 
 MOMENTS = (1, 3, 10, 30, 100)
 """Transitions that are learned from before the next are predicted."""

@@ -25,7 +25,7 @@ from headway.experiment.methods import config_to_evaluate
 from headway.report.tables import by_physics
 from headway.storage.records import read_csv, write_csv
 from headway.storage.run_dir import RunDir
-from headway.tasks.catalog import sim_param_sets
+from headway.task import sim_param_sets
 from headway.training.progress import make_progress
 
 COLUMNS = (

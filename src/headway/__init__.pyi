@@ -46,10 +46,10 @@ from .service import load as load
 from .sim_params import SimParamSets as SimParamSets
 from .storage.run_dir import RunDir as RunDir
 from .storage.tables import EpisodeRow as EpisodeRow
-from .tasks.base import Task as Task
-from .tasks.catalog import EnvSpec as EnvSpec
-from .tasks.catalog import env_spec as env_spec
-from .tasks.catalog import register as register
+from .task import EnvSpec as EnvSpec
+from .task import Task as Task
+from .task import env_spec as env_spec
+from .task import register as register
 
 __all__: list[str]
 __version__: str

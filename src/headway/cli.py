@@ -151,7 +151,7 @@ class Train(Command):
     def settings(self) -> dict[str, Any]:
         """Settings by dotted name that differ from those of method and preset."""
         from headway.experiment.methods import make_config
-        from headway.tasks.catalog import env_spec
+        from headway.task import env_spec
 
         config = make_config(self.env, method=self.method, preset=self.preset)
         settings = self.changed(config)
@@ -539,7 +539,7 @@ class PlotDynamics(Command):
             raise ConfigError(f"--num-states is {self.num_states}, allowed: at least 1.")
         from headway.report import dynamics
         from headway.storage.files import check_target
-        from headway.tasks.catalog import env_spec
+        from headway.task import env_spec
 
         name = env_spec(self.env).name
         out = self.output or Path(f"{name}-dynamics.png")

@@ -29,6 +29,9 @@ class SimParamSets:
         ('train', 'long')
         >>> sets.group("train")
         [{'length': 0.5}, {'length': 1.0}]
+
+    Raises:
+        ConfigError: A part is missing, unknown, of the wrong type, or no finite number.
     """
 
     train: Values
@@ -37,12 +40,12 @@ class SimParamSets:
     """Values of each parameter in each group of test physics, by the group's name."""
 
     def __post_init__(self) -> None:
-        _check_values("train", self.train)
         if not isinstance(self.unseen, Mapping):
             raise ConfigError(
                 f"sim_params unseen is {shown(self.unseen)}, allowed: parameter values by"
                 " group name."
             )
+        _check_values("train", self.train)
         for name, values in self.unseen.items():
             if name == "train" or not isinstance(name, str):
                 raise ConfigError(
@@ -50,7 +53,11 @@ class SimParamSets:
                     " 'train'."
                 )
             _check_values(f"unseen group {shown(name)}", values)
-            _check_same_names(name, values, self.train)
+            if set(values) != set(self.train):
+                raise ConfigError(
+                    f"sim_params unseen group {name!r} has {', '.join(map(str, values))}, allowed:"
+                    f" a value for every parameter of train, {', '.join(self.train)}."
+                )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -74,9 +81,7 @@ class SimParamSets:
         Raises:
             UnknownNameError: There is no such group.
         """
-        if name not in self.group_names:
-            raise unknown_name("group", name, self.group_names)
-        values = self.train if name == "train" else self.unseen[name]
+        values = self._values(name)
         combinations = itertools.product(*values.values())
         return [dict(zip(values, map(float, chosen), strict=True)) for chosen in combinations]
 
@@ -87,36 +92,33 @@ class SimParamSets:
         each parameter goes evenly through its values, in an order of its own that is always the
         same.
 
-        Args:
-            name: `"train"` or an unseen group.
-            count: How many.
-
         Raises:
             UnknownNameError: There is no such group.
         """
         combinations = self.group(name)
         if count >= len(combinations):
             return [combinations[i % len(combinations)] for i in range(count)]
-        values = self.train if name == "train" else self.unseen[name]
         rng = np.random.default_rng(0)
         columns = {
-            parameter: rng.permutation(np.arange(count) * len(numbers) // count)
-            for parameter, numbers in values.items()
+            parameter: np.array(numbers)[rng.permutation(np.arange(count) * len(numbers) // count)]
+            for parameter, numbers in self._values(name).items()
         }
-        return [
-            {
-                parameter: float(values[parameter][places[i]])
-                for parameter, places in columns.items()
-            }
-            for i in range(count)
-        ]
+        return [{key: float(column[i]) for key, column in columns.items()} for i in range(count)]
+
+    def _values(self, name: str) -> Values:
+        if name not in self.group_names:
+            raise unknown_name("group", name, self.group_names)
+        return self.train if name == "train" else self.unseen[name]
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain dictionaries and lists, ready for JSON."""
-        return {
-            "train": _to_lists(self.train),
-            "unseen": {name: _to_lists(values) for name, values in self.unseen.items()},
+        lists = {
+            group: {
+                key: [float(x) for x in numbers] for key, numbers in self._values(group).items()
+            }
+            for group in self.group_names
         }
+        return {"train": lists.pop("train"), "unseen": lists}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "SimParamSets":
@@ -125,16 +127,11 @@ class SimParamSets:
         Raises:
             ConfigError: A part is missing, unknown, of the wrong type, or no finite number.
         """
-        if not isinstance(values, Mapping) or "train" not in values:
+        if not isinstance(values, Mapping) or not {"train"} <= set(values) <= {"train", "unseen"}:
             raise ConfigError(
                 f"sim_params is {shown(values)}, allowed: {{'train': {{name: [values]}}, 'unseen':"
                 " {group: {name: [values]}}}."
             )
-        for key in values:
-            if key not in ("train", "unseen"):
-                raise ConfigError(
-                    str(unknown_name("sim_params key", str(key), ["train", "unseen"]))
-                )
         unseen = values.get("unseen", {})
         if isinstance(unseen, Mapping):
             unseen = {name: _to_tuples(group) for name, group in unseen.items()}
@@ -161,26 +158,9 @@ def _check_values(where: str, values: Any) -> None:
         )
 
 
-def _check_same_names(group: str, values: Values, train: Values) -> None:
-    """An unseen group must say the value of every parameter, and of no other."""
-    for name in values:
-        if name not in train:
-            raise ConfigError(str(unknown_name(f"parameter in group {group!r}", str(name), train)))
-    missing = [name for name in train if name not in values]
-    if missing:
-        raise ConfigError(
-            f"sim_params unseen group {group!r} lacks {', '.join(missing)}; give every parameter"
-            f" of train a value: {', '.join(train)}."
-        )
-
-
 def _is_finite(value: Any) -> bool:
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
     return bool(number and abs(value) <= sys.float_info.max)
-
-
-def _to_lists(values: Values) -> dict[str, list[float]]:
-    return {name: [float(value) for value in numbers] for name, numbers in values.items()}
 
 
 def _to_tuples(values: Any) -> Any:

@@ -9,16 +9,15 @@ import pytest
 from killing import Listening
 
 import misbehaving
-from headway import envs
+from headway import envs, task
+from headway.envs.classic import PendulumTask
 from headway.errors import BadEnvironmentError
 from headway.experiment import training
 from headway.experiment.rollouts import Arena, Episode, random_policy, run_episodes
 from headway.experiment.testing import run_tests
 from headway.sim_params import SimParamSets
 from headway.storage.interrupts import StopRequest
-from headway.tasks import catalog
-from headway.tasks.catalog import EnvSpec, register
-from headway.tasks.classic import PendulumTask
+from headway.task import EnvSpec, register
 
 FAR = 5.0
 """Physics of the tests only."""
@@ -37,7 +36,7 @@ def drift():
     sets = SimParamSets({"drift": (0.5, 1.0)}, {"far": {"drift": (FAR,)}})
     register(EnvSpec("drift", "own/Drift-v0", PendulumTask, sets, 6, {"drift": 0.5}))
     yield make
-    del gymnasium.registry["own/Drift-v0"], catalog._SPECS["drift"]
+    del gymnasium.registry["own/Drift-v0"], task._registered["drift"]
 
 
 def config(**settings):
@@ -187,7 +186,9 @@ def test_an_episode_that_mujoco_gives_up_is_left_out(separate, tmp_path, monkeyp
             state[9:18] = 1e12
             env.set_state(state)
         else:
-            arena.vector._state[1, 0, 10:19] = 1e12
+            state = arena.vector.get_state(1)
+            state[9:18] = 1e12
+            arena.vector.set_state(1, state)
         return found
 
     monkeypatch.setattr(arena.vector, "reset", diverging)

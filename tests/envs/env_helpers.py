@@ -3,7 +3,7 @@
 import numpy as np
 
 from headway import envs
-from headway.tasks.catalog import env_spec
+from headway.task import env_spec
 
 NAMES = (
     "pendulum",

@@ -9,7 +9,7 @@ from gymnasium.utils.env_checker import check_env
 from headway import envs
 from headway.errors import BrokenEpisodeError, ConfigError, UnknownNameError
 from headway.sim_params import SimParamSets
-from headway.tasks.catalog import env_spec
+from headway.task import env_spec
 
 OBS_SIZES = (3, 5, 12, 45, 18, 41)
 
@@ -150,7 +150,7 @@ def test_unknown_names_are_refused_with_a_hint(env, name):
     with pytest.raises(ConfigError):
         envs.make(name, sim_params=SimParamSets({key + "s": (1.0,)}))
     with pytest.raises(ConfigError, match="render_mode"):
-        type(env.unwrapped)(render_mode="human")
+        envs.HeadwayEnv(name, render_mode="human")
 
 
 def test_own_sets_replace_the_training_values(name):

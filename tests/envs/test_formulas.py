@@ -9,7 +9,7 @@ import pytest
 from env_helpers import ROBOTS, actions_of
 
 from headway import envs
-from headway.envs.robots import load_model
+from headway.envs.locomotion import load_model
 
 
 def stepped(env, state, action, **sim_params):
@@ -96,7 +96,7 @@ def test_cartpole_reset():
 
 
 def raw(env):
-    data = env.unwrapped.data
+    data = env.unwrapped.vector.datas[0]
     return data.qpos.copy(), data.qvel.copy()
 
 
@@ -172,7 +172,7 @@ def test_crippled_leg_gets_no_control(leg, silent):
     env.step(np.full(8, 0.5, np.float32))
     expected = np.full(8, 0.5)
     expected[silent] = 0.0
-    np.testing.assert_array_equal(env.unwrapped.data.ctrl, expected)
+    np.testing.assert_array_equal(env.unwrapped.vector.datas[0].ctrl, expected)
 
 
 def test_crippled_leg_shrinks_only_if_asked_for():
@@ -182,22 +182,26 @@ def test_crippled_leg_shrinks_only_if_asked_for():
         env.reset(seed=0, options={"sim_params": {"crippled_leg": 3}})
         env.reset(seed=0, options={"sim_params": {"crippled_leg": 1}})
     upper, lower = (nominal.geom(n).id for n in ("right_leg_geom", "right_ankle_geom"))
-    changed = np.flatnonzero((small.unwrapped.model.geom_size != nominal.geom_size).any(1))
-    np.testing.assert_array_equal(plain.unwrapped.model.geom_size, nominal.geom_size)
+    changed = np.flatnonzero(
+        (small.unwrapped.vector.models[0].geom_size != nominal.geom_size).any(1)
+    )
+    np.testing.assert_array_equal(plain.unwrapped.vector.models[0].geom_size, nominal.geom_size)
     np.testing.assert_array_equal(changed, sorted([upper, lower]))
     half = nominal.geom_size[[upper, lower]] / 2
-    np.testing.assert_array_equal(small.unwrapped.model.geom_size[[upper, lower]], half)
-    np.testing.assert_array_equal(small.unwrapped.model.geom_pos[lower], nominal.geom_pos[upper])
+    np.testing.assert_array_equal(small.unwrapped.vector.models[0].geom_size[[upper, lower]], half)
+    np.testing.assert_array_equal(
+        small.unwrapped.vector.models[0].geom_pos[lower], nominal.geom_pos[upper]
+    )
 
 
 @pytest.mark.parametrize("name", [n for n in ROBOTS if n != "crippled-ant"])
 @pytest.mark.parametrize("scale_inertia", [False, True])
 def test_scales_change_what_they_say_and_nothing_else(name, scale_inertia):
     env = envs.make(name, scale_inertia=scale_inertia)
-    nominal = env.unwrapped._world.nominal
+    nominal = env.unwrapped.vector.world.nominal
     env.reset(options={"sim_params": {"mass_scale": 0.5, "damping_scale": 3.0}})
     env.reset(options={"sim_params": {"mass_scale": 1.5, "damping_scale": 2.0}})
-    model = env.unwrapped.model
+    model = env.unwrapped.vector.models[0]
     inertia = 1.5 if scale_inertia else 1.0
     np.testing.assert_array_equal(model.body_mass, nominal.body_mass * 1.5)
     np.testing.assert_array_equal(model.dof_damping, nominal.dof_damping * 2.0)
@@ -213,7 +217,7 @@ def test_scales_change_what_they_say_and_nothing_else(name, scale_inertia):
 def test_robot_resets(name, noise):
     env = envs.make(name)
     starts = [(env.reset(seed=s), raw(env))[1] for s in range(200)]
-    nominal = env.unwrapped._world.nominal
+    nominal = env.unwrapped.vector.world.nominal
     away = np.array([qpos - nominal.qpos0 for qpos, _ in starts])
     speed = np.array([qvel for _, qvel in starts])
     if name in ("slim-humanoid", "crippled-ant"):
@@ -269,7 +273,7 @@ def test_loading_the_models_warns_of_nothing(capfd, tmp_path, monkeypatch):
     [("hopper", 4), ("slim-humanoid", 5), ("half-cheetah", 5), ("crippled-ant", 5)],
 )
 def test_control_step(name, skip):
-    world = envs.make(name).unwrapped._world
+    world = envs.make(name).unwrapped.vector.world
     steps = {"hopper": 0.002, "slim-humanoid": 0.003, "half-cheetah": 0.01, "crippled-ant": 0.01}
     assert world.frame_skip == skip
     assert world.nominal.opt.timestep == steps[name]

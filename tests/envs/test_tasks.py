@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from headway import envs
+from headway.envs.classic import PendulumTask
+from headway.envs.locomotion import HalfCheetahTask, HopperTask, SlimHumanoidTask
 from headway.errors import ConfigError
 from headway.sim_params import SimParamSets
-from headway.tasks.catalog import EnvSpec, env_names, env_spec, register
-from headway.tasks.classic import PendulumTask
-from headway.tasks.locomotion import HalfCheetahTask, HopperTask, SlimHumanoidTask
+from headway.task import EnvSpec, env_names, env_spec, register
 
 
 def task_of(name, **options):
@@ -175,7 +175,9 @@ def test_register_refuses_what_contradicts_itself():
     def spec(name="own", length=10, **defaults):
         return EnvSpec(name, "own/Env-v0", PendulumTask, sets, length, defaults)
 
-    for bad in (spec("hopper", mass=1.0), spec(length=0, mass=1.0), spec(masses=1.0)):
+    for name, length, defaults in (("own", 0, {"mass": 1.0}), ("own", 10, {"masses": 1.0})):
         with pytest.raises(ConfigError):
-            register(bad)
+            spec(name, length, **defaults)
+    with pytest.raises(ConfigError, match="taken"):
+        register(spec("hopper", mass=1.0))
     assert "own" not in env_names()

@@ -6,13 +6,12 @@ import pytest
 from env_helpers import NAMES, all_physics, distinct_physics
 from gymnasium.vector import AutoresetMode
 
-from headway import envs
-from headway.envs import ClassicVectorEnv, RolloutVectorEnv, SequentialVectorEnv
+from headway import envs, task
+from headway.envs import ClassicVectorEnv, RobotVectorEnv, SequentialVectorEnv
+from headway.envs.classic import PendulumTask
 from headway.errors import BadEnvironmentError, ConfigError, UnknownNameError
 from headway.sim_params import SimParamSets
-from headway.tasks import catalog
-from headway.tasks.catalog import EnvSpec, env_spec, register
-from headway.tasks.classic import PendulumTask
+from headway.task import EnvSpec, env_spec, register
 
 NUM = 5
 
@@ -116,7 +115,7 @@ def test_spaces_and_kinds(name):
     assert vector.num_envs == 3
     obs, _ = vector.reset(seed=0)
     assert obs in vector.observation_space
-    robots = RolloutVectorEnv if name in NAMES[2:] else ClassicVectorEnv
+    robots = RobotVectorEnv if name in NAMES[2:] else ClassicVectorEnv
     assert isinstance(vector, robots)
     kept = obs.copy()
     vector.step(vector.action_space.sample())
@@ -128,7 +127,7 @@ def test_gymnasium_makes_the_same_vector_environment():
     vector = gymnasium.make_vec(
         "headway/Hopper-v0", 2, vectorization_mode="vector_entry_point", scale_inertia=True
     )
-    assert isinstance(vector, RolloutVectorEnv)
+    assert isinstance(vector, RobotVectorEnv)
     assert vector.episode_length == 500
     assert vector.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     vector.close()
@@ -166,7 +165,7 @@ def test_bad_options_are_refused_and_change_nothing(options):
     with pytest.raises(ConfigError) as caught:
         vector.reset(seed=1, options=options)
     assert "\n" not in str(caught.value)
-    np.testing.assert_array_equal(vector._observe(), obs)
+    np.testing.assert_array_equal(vector.observe(), obs)
     np.testing.assert_array_equal(vector.sim_params["length"], info["sim_params"]["length"])
 
 
@@ -196,7 +195,9 @@ def test_a_simulation_that_diverges_is_told(tmp_path, monkeypatch):
     vector.reset(seed=0)
     plain = envs.make_vec("half-cheetah", 3)
     plain.reset(seed=0)
-    vector._state[1, 0, 10:19] = 1e12
+    state = vector.get_state(1)
+    state[9:18] = 1e12
+    vector.set_state(1, state)
     action = vector.action_space.sample()
     obs, reward, terminated, truncated, info = vector.step(action)
     assert info["broken"] == {1: "the simulation of half-cheetah diverged (BADQVEL)"}
@@ -253,7 +254,7 @@ def own_spec():
     )
     register(spec)
     yield spec
-    del gymnasium.registry["own/Drift-v0"], catalog._SPECS["drift"]
+    del gymnasium.registry["own/Drift-v0"], task._registered["drift"]
 
 
 def test_environments_of_ones_own(own_spec):
@@ -300,12 +301,12 @@ def test_own_physics_under_another_name_steps_as_fast():
     )
     try:
         vector = envs.make_vec("moon-hopper", 2)
-        assert isinstance(vector, RolloutVectorEnv)
+        assert isinstance(vector, RobotVectorEnv)
         assert vector.episode_length == 50
         assert vector.reset(seed=0)[1]["sim_params"]["mass_scale"][0] == pytest.approx(1 / 6)
         vector.close()
     finally:
-        del catalog._SPECS["moon-hopper"]
+        del task._registered["moon-hopper"]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -8,7 +8,7 @@ import pytest
 import headway
 from headway.errors import ConfigError
 from headway.experiment.methods import METHODS
-from headway.tasks.catalog import env_names
+from headway.task import env_names
 
 TINY = {
     "collection.episode_length": 12,

@@ -10,7 +10,7 @@ from headway.experiment.methods import METHODS, PRESETS, make_config
 from headway.experiment.references import score
 from headway.planning.flop import plan_flop
 from headway.storage.tables import format_sim_params, parse_sim_params
-from headway.tasks.catalog import env_names, env_spec
+from headway.task import env_names, env_spec
 
 
 @pytest.mark.parametrize("env", env_names())

@@ -12,8 +12,7 @@ from headway.experiment import loading, training
 from headway.experiment.methods import make_config
 from headway.storage import arrays
 from headway.storage.run_dir import RunDir
-from headway.tasks.catalog import env_names
-from headway.training.progress import Progress
+from headway.task import env_names
 
 TINY = {"collection.episode_length": 12, "fitting.epochs": 1}
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import headway
-from headway.envs.vector_worlds import ClassicVectorEnv, RolloutVectorEnv
+from headway.envs.built_in import ClassicVectorEnv, RobotVectorEnv
 from headway.errors import ConfigError
 from headway.experiment import training
 from headway.experiment.methods import make_config
@@ -18,7 +18,7 @@ from headway.experiment.true_dynamics import (
 )
 from headway.planning.controller import env_action
 from headway.planning.returns import RolloutSettings, candidate_returns
-from headway.tasks.catalog import env_names, env_spec
+from headway.task import env_names, env_spec
 
 CLASSIC = ["pendulum", "cartpole-swingup"]
 ROBOTS = ["hopper", "slim-humanoid", "half-cheetah", "crippled-ant"]
@@ -117,8 +117,8 @@ def test_imagined_returns_of_robots_are_what_the_environment_pays_to_the_bit(env
 def test_a_robot_that_mujoco_gives_up_on_ranks_last():
     config, arena = begin("half-cheetah", every_physics("half-cheetah")[:1])
     vector = arena.vector
-    assert isinstance(vector, RolloutVectorEnv)
-    vector._state[0, 0, 5] = 1e12  # beyond what MuJoCo accepts
+    assert isinstance(vector, RobotVectorEnv)
+    vector.datas[0].qpos[4] = 1e12  # beyond what MuJoCo accepts
     simulator = make_simulator(arena, config.planner)
     candidates = np.zeros((1, 2, 4, arena.task.action_size), np.float32)
     assert not np.isfinite(simulator.returns(candidates)).any()

@@ -15,6 +15,7 @@ import pytest
 
 from headway.config import FittingConfig
 from headway.data import History, segment_sums
+from headway.envs.locomotion import HalfCheetahTask
 from headway.models.dynamics import ContextEncoder, GaussianNet, MultiHeadDynamics, Statistics
 from headway.models.fitting import Assignment, Batch, head_losses, total_loss
 from headway.models.losses import (
@@ -25,7 +26,6 @@ from headway.models.losses import (
     weight_decay_loss,
 )
 from headway.models.networks import Dense, DenseHeads, Normalizer
-from headway.tasks.locomotion import HalfCheetahTask
 
 SEGMENT = 10
 NUM_HEADS = 3

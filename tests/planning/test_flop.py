@@ -7,7 +7,7 @@ import pytest
 import toys
 from headway.config import ModelConfig, PlannerConfig
 from headway.planning.flop import plan_flop, step_flop
-from headway.tasks.catalog import env_spec
+from headway.task import env_spec
 
 MODEL = ModelConfig(hidden_sizes=(8, 6), num_heads=3)
 PLANNER = PlannerConfig(

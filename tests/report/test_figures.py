@@ -15,7 +15,7 @@ from headway.report.obs_names import obs_names
 from headway.report.physics import axis_label, distinct, full_label, varying
 from headway.report.tables import by_group, by_physics, envs, evaluation
 from headway.storage.tables import EpisodeRow
-from headway.tasks.catalog import env_spec
+from headway.task import env_spec
 
 ALL = ["learning_curve.png", "evaluation.png", "head_shares.png", "prediction_error.png"]
 

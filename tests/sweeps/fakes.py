@@ -11,7 +11,7 @@ from headway.storage.run_dir import RunDir
 from headway.storage.tables import EpisodeRow
 from headway.sweeps.board import Board
 from headway.sweeps.jobs import Job
-from headway.tasks.catalog import sim_param_sets
+from headway.task import sim_param_sets
 
 TINY = {
     "collection.episode_length": 6,

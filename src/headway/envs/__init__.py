@@ -1,27 +1,9 @@
-"""Environments whose physics can be set. Importing this registers them with Gymnasium."""
+"""Environments whose physics can be set.
 
-from headway.envs.classic import CartPoleSwingUpEnv, PendulumEnv
-from headway.envs.locomotion import CrippledAntEnv, HalfCheetahEnv, HopperEnv, SlimHumanoidEnv
-from headway.envs.making import make, make_vec, register_all
-from headway.envs.processes.vector import ProcessVectorEnv
-from headway.envs.separate import SequentialVectorEnv
-from headway.envs.vector import HeadwayVectorEnv
-from headway.envs.vector_worlds import ClassicVectorEnv, RolloutVectorEnv
+Names stand in `__init__.pyi` and are loaded when first used: a controller takes a Task from here
+and needs no simulator. `make` and `make_vec` also tell Gymnasium the ids `headway/Hopper-v0` etc.
+"""
 
-__all__ = [
-    "CartPoleSwingUpEnv",
-    "ClassicVectorEnv",
-    "CrippledAntEnv",
-    "HalfCheetahEnv",
-    "HeadwayVectorEnv",
-    "HopperEnv",
-    "PendulumEnv",
-    "ProcessVectorEnv",
-    "RolloutVectorEnv",
-    "SequentialVectorEnv",
-    "SlimHumanoidEnv",
-    "make",
-    "make_vec",
-]
+import lazy_loader
 
-register_all()
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,114 +1,197 @@
-# pyright: reportAttributeAccessIssue=false
-# (the names compiled into mujoco have no stubs)
+"""Hopper, SlimHumanoid, HalfCheetah and CrippledAnt: Task, laws and physics.
 
-"""Hopper, SlimHumanoid, HalfCheetah and CrippledAnt, stepped one at a time by MuJoCo."""
+The formulas are NumPy on arrays with any number of leading axes. The models are the XML
+files that Gymnasium ships; MuJoCo is imported when the first one is loaded.
+"""
 
-from typing import Any
+import abc
+import copy
+import functools
+import importlib.util
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
 
-import mujoco
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from headway.envs.rendering import OffscreenRenderer
-from headway.envs.robots import (
-    CrippledAnt,
-    HalfCheetah,
-    Hopper,
-    Robot,
-    RobotState,
-    SlimHumanoid,
-)
-from headway.envs.world import WorldEnv, check_state
+from headway.envs.world import World
 from headway.sim_params import SimParamSets
+from headway.task import Action, EnvSpec, Obs, Reward, Task
+
+GREY = (0.42, 0.44, 0.47, 1.0)
+"""Colour of a crippled leg."""
 
 
-class LocomotionEnv(WorldEnv):
-    """One robot with a MuJoCo model of its own."""
+class RobotState(NamedTuple):
+    """State of one or many robots."""
 
-    _world: Robot
+    qpos: np.ndarray
+    qvel: np.ndarray
+    velocity: np.ndarray
+    """Average forward velocity over the control step that led here (m/s); 0 at reset."""
 
-    def __init__(self, robot: Robot, render_mode: str | None):
-        super().__init__(robot, render_mode)
-        self.metadata = self.metadata | {"render_fps": round(1 / robot.time_step)}
-        self.model = robot.new_model()
-        self.data = mujoco.MjData(self.model)
-        self._velocity = 0.0
-        self._renderer: OffscreenRenderer | None = None
-        self._apply_sim_params()
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Make one control step; actions beyond their bounds are clipped.
+class Camera(NamedTuple):
+    """A camera that follows the robot from the side, looking at a height (m)."""
 
-        Raises:
-            ConfigError: The action has the wrong shape or is not finite.
-            BrokenEpisodeError: The simulation diverged.
+    distance: float
+    elevation: float
+    height: float
+
+
+class Robot(World):
+    """A robot that is paid for moving forward."""
+
+    obs_dtype = np.float64
+    xml: ClassVar[str]
+    frame_skip: ClassVar[int]
+    camera: ClassVar[Camera]
+
+    def __init__(self, sim_params: SimParamSets | None = None, **options: bool):
+        super().__init__(sim_params, **options)
+        self.nominal = load_model(self.xml)
+        self.time_step = self.frame_skip * self.nominal.opt.timestep
+
+    def new_model(self) -> Any:
+        """Return a copy of the unchanged robot's `MjModel`."""
+        return copy.copy(self.nominal)
+
+    @abc.abstractmethod
+    def initial_state(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Draw the positions and velocities that an episode starts with."""
+
+    def set_physics(self, model: Any, sim_params: Mapping[str, float]) -> None:
+        """Scale the nominal masses and damping.
+
+        As in the released code only `body_mass` and `dof_damping` change: rotational inertia
+        and the constants that MuJoCo derives keep their values. The option `scale_inertia`
+        scales `body_inertia` with the mass.
         """
-        robot, data = self._world, self.data
-        action = robot.clip(action, (self.model.nu,))
-        self._begin_step()
-        before = self._robot_state()
-        data.ctrl[:] = robot.control(action, self._sim_params)
-        mujoco.mj_step(self.model, data, nstep=robot.frame_skip)
-        robot.check_warnings(data, self._sim_params)
-        after = robot.after_step(before, data.qpos.copy(), data.qvel.copy())
-        self._velocity = float(after.velocity)
-        reward = float(robot.reward(before, action, after))
-        return robot.observe(after), reward, False, False, self._info()
+        mass = sim_params["mass_scale"]
+        model.body_mass[:] = self.nominal.body_mass * mass
+        model.dof_damping[:] = self.nominal.dof_damping * sim_params["damping_scale"]
+        if self.task.scale_inertia:
+            model.body_inertia[:] = self.nominal.body_inertia * mass
 
-    def observation(self) -> np.ndarray:
-        """Return the observation of the present state."""
-        return self._world.observe(self._robot_state())
+    def control(self, action: np.ndarray, sim_params: Mapping[str, Any]) -> np.ndarray:
+        """Return what the actuators receive."""
+        del sim_params
+        return action
 
-    def get_state(self) -> np.ndarray:
-        """Return positions, velocities, the solver's warm start, and the average velocity."""
-        data = self.data
-        return np.concatenate([data.qpos, data.qvel, data.qacc_warmstart, [self._velocity]])
+    @abc.abstractmethod
+    def observe(self, state: RobotState) -> np.ndarray:
+        """Return the observation [..., obs] of a state."""
 
-    def set_state(self, state: np.ndarray) -> None:
-        """Go to a state that `get_state` returned.
+    @abc.abstractmethod
+    def reward(self, before: RobotState, action: np.ndarray, after: RobotState) -> np.ndarray:
+        """Return the reward [...] of a step."""
 
-        Raises:
-            ConfigError: The state has the wrong size or is not finite.
+    def after_step(self, before: RobotState, qpos: np.ndarray, qvel: np.ndarray) -> RobotState:
+        """Assemble the state that a step led to."""
+        velocity = (qpos[..., 0] - before.qpos[..., 0]) / self.time_step
+        return RobotState(qpos, qvel, velocity)
+
+    def warning(self, data: Any) -> str:
+        """Return MuJoCo's complaint about an `MjData`: huge numbers or full buffers; or nothing.
+
+        It would quietly start over from the nominal state.
         """
-        nq, nv = self.model.nq, self.model.nv
-        state = check_state(self._world.name, state, nq + 2 * nv + 1)
-        self.data.warning.number[:] = 0  # they are of where it was before
-        parts = np.split(state, [nq, nq + nv, nq + 2 * nv])
-        self.data.qpos[:], self.data.qvel[:], self.data.qacc_warmstart[:] = parts[:3]
-        self._velocity = float(parts[3][0])
+        counts = data.warning.number
+        if not counts.any():
+            return ""
+        import mujoco
 
-    def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Draw the present state, if `render_mode` is `"rgb_array"`.
-
-        Raises:
-            BadEnvironmentError: No OpenGL library for drawing without a screen was found.
-        """
-        if self.render_mode is None:
-            return None
-        if self._renderer is None:
-            self._renderer = OffscreenRenderer(self.model, self._world.camera)
-        return self._renderer.frame(self.model, self.data)
-
-    def close(self) -> None:
-        """Free the renderer."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
-
-    def _robot_state(self) -> RobotState:
-        velocity = np.float64(self._velocity)
-        return RobotState(self.data.qpos.copy(), self.data.qvel.copy(), np.asarray(velocity))
-
-    def _reset_state(self) -> None:
-        state = self._world.initial_state(self.np_random)
-        mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[:], self.data.qvel[:] = state.qpos, state.qvel
-        self._velocity = float(state.velocity)
-
-    def _apply_sim_params(self) -> None:
-        self._world.set_physics(self.model, self._sim_params)
+        name = mujoco.mjtWarning(int(np.argmax(counts))).name.removeprefix("mjWARN_")
+        return f"the simulation of {self.spec.name} diverged ({name})"
 
 
-class HopperEnv(LocomotionEnv):
+def _mass_sets(train: tuple[float, ...], low: tuple[float, ...], high: tuple[float, ...]):
+    """Sets of mass scales whose damping scale is always 1, as in the paper."""
+    one = {"damping_scale": (1.0,)}
+    unseen = {"low": {"mass_scale": low, **one}, "high": {"mass_scale": high, **one}}
+    return SimParamSets({"mass_scale": train, **one}, unseen)
+
+
+def _effort(action: Action) -> Reward:
+    return jnp.square(action).sum(-1)
+
+
+class HopperTask(Task):
+    """Hop forward; falling ends nothing and costs nothing by itself.
+
+    reward = (x' - x) / 0.008 + 1 - 0.001 Σ a².
+
+    The position x is not observed, so the observation's last entry is the average forward
+    velocity over the control step just done, (x' - x) / 0.008. It is predicted as it is, not
+    as a difference, and is no feature, like HalfCheetah's first entry.
+
+    With `observe_average_velocity=False` the observation has the released code's 11 entries;
+    then the velocity at the end of the step, clipped to ±10 m/s, stands in for the average
+    and `reward` only approximates what the environment pays.
+
+    References:
+        Supplement A.1; released `hopper_env.py`.
+    """
+
+    action_size: ClassVar[int] = 3
+    action_low: ClassVar[tuple[float, ...]] = (-1.0,) * 3
+    action_high: ClassVar[tuple[float, ...]] = (1.0,) * 3
+
+    scale_inertia: bool = False
+    """Whether the mass scale applies to the rotational inertia too."""
+    observe_average_velocity: bool = True
+    """Whether the observation has the average forward velocity as its last entry."""
+
+    @property
+    def obs_size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Width of an observation: 12, or the released code's 11."""
+        return 12 if self.observe_average_velocity else 11
+
+    def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
+        """Forward velocity over the step, a constant for being alive, and the effort."""
+        del obs
+        velocity = next_obs[..., 11 if self.observe_average_velocity else 5]
+        return velocity + 1.0 - 1e-3 * _effort(self.clip_action(action))
+
+    def released_reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
+        """As released: the clipped velocity before the step."""
+        del next_obs
+        return obs[..., 5] + 1.0 - 1e-3 * _effort(self.unscale_action(action))
+
+    def preprocess(self, obs: Obs) -> Float[Array, "*batch features"]:
+        """Drop the average velocity."""
+        return obs[..., :11]
+
+    def target(self, obs: Obs, next_obs: Obs) -> Obs:
+        """Differences, and the average velocity itself."""
+        delta = next_obs - obs
+        if not self.observe_average_velocity:
+            return delta
+        return delta.at[..., 11].set(next_obs[..., 11])
+
+    def postprocess(self, obs: Obs, delta: Obs) -> Obs:
+        """Undo `target`."""
+        next_obs = obs + delta
+        if not self.observe_average_velocity:
+            return next_obs
+        return next_obs.at[..., 11].set(delta[..., 11])
+
+
+HOPPER = EnvSpec(
+    name="hopper",
+    env_id="headway/Hopper-v0",
+    make_task=HopperTask,
+    sim_params=_mass_sets((0.5, 0.75, 1.0, 1.25, 1.5), (0.25, 0.375), (1.75, 2.0)),
+    episode_length=500,
+    default_sim_params={"mass_scale": 1.0, "damping_scale": 1.0},
+    options={"scale_inertia": False, "observe_average_velocity": True},
+    description="hop forward on one leg with unknown masses",
+)
+
+
+class Hopper(Robot):
     """Hop forward on one leg with unknown masses; falling ends nothing.
 
     | What | Value |
@@ -128,23 +211,71 @@ class HopperEnv(LocomotionEnv):
     cannot be told from the other 11.
     """
 
-    def __init__(
-        self,
-        *,
-        scale_inertia: bool = False,
-        observe_average_velocity: bool = True,
-        sim_params: SimParamSets | None = None,
-        render_mode: str | None = None,
-    ):
-        robot = Hopper(
-            sim_params,
-            scale_inertia=scale_inertia,
-            observe_average_velocity=observe_average_velocity,
-        )
-        super().__init__(robot, render_mode)
+    spec, xml, frame_skip = HOPPER, "hopper.xml", 4
+    camera = Camera(distance=3.1, elevation=-8.0, height=0.75)
+
+    def initial_state(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Uniform noise of ±0.005 on positions and velocities."""
+        qpos = self.nominal.qpos0 + rng.uniform(-0.005, 0.005, self.nominal.nq)
+        return qpos, rng.uniform(-0.005, 0.005, self.nominal.nv)
+
+    def observe(self, state: RobotState) -> np.ndarray:
+        """Return positions but x, clipped velocities, and the average forward velocity."""
+        velocity = state.velocity[..., None]
+        parts = [state.qpos[..., 1:], np.clip(state.qvel, -10.0, 10.0), velocity]
+        return np.concatenate(parts, axis=-1)[..., : self.task.obs_size]
+
+    def reward(self, before: RobotState, action: np.ndarray, after: RobotState) -> np.ndarray:
+        """Forward velocity, 1 for being alive, and a small price of effort."""
+        del before
+        return after.velocity + 1.0 - 1e-3 * np.square(action).sum(-1)
 
 
-class SlimHumanoidEnv(LocomotionEnv):
+class SlimHumanoidTask(Task):
+    """Walk forward upright, with a humanoid observed only by its joints.
+
+    reward = (0.25 / 0.015) ẋ - 0.1 Σ a² + 5 [1 ≤ z' ≤ 2], ẋ before and z' after the step.
+
+    References:
+        Supplement A.1; released `slim_humanoid_env.py`.
+    """
+
+    obs_size: ClassVar[int] = 45
+    action_size: ClassVar[int] = 17
+    action_low: ClassVar[tuple[float, ...]] = (-0.4,) * 17
+    action_high: ClassVar[tuple[float, ...]] = (0.4,) * 17
+
+    scale_inertia: bool = False
+    """Whether the mass scale applies to the rotational inertia too."""
+
+    def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
+        """Forward velocity before the step, effort, and a bonus for standing after it."""
+        height = next_obs[..., 0]
+        standing = (height >= 1.0) & (height <= 2.0)
+        effort = _effort(self.clip_action(action))
+        return 0.25 / 0.015 * obs[..., 22] - 0.1 * effort + 5.0 * standing
+
+    def released_reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
+        """As released: unscaled effort, and `obs[1]` (of the quaternion) taken for the height."""
+        del next_obs
+        standing = (obs[..., 1] > 1.0) & (obs[..., 1] < 2.0)
+        effort = _effort(self.unscale_action(action))
+        return 0.25 / 0.015 * obs[..., 22] - 0.1 * effort + 5.0 * standing
+
+
+SLIM_HUMANOID = EnvSpec(
+    name="slim-humanoid",
+    env_id="headway/SlimHumanoid-v0",
+    make_task=SlimHumanoidTask,
+    sim_params=_mass_sets((0.8, 0.9, 1.0, 1.15, 1.25), (0.6, 0.7), (1.5, 1.6)),
+    episode_length=1000,
+    default_sim_params={"mass_scale": 1.0, "damping_scale": 1.0},
+    options={"scale_inertia": False},
+    description="walk upright as a humanoid with unknown masses",
+)
+
+
+class SlimHumanoid(Robot):
     """Walk forward upright as a humanoid with unknown masses; falling ends nothing.
 
     | What | Value |
@@ -162,17 +293,85 @@ class SlimHumanoidEnv(LocomotionEnv):
     Source: supplement A.1 and released `slim_humanoid_env.py`.
     """
 
-    def __init__(
-        self,
-        *,
-        scale_inertia: bool = False,
-        sim_params: SimParamSets | None = None,
-        render_mode: str | None = None,
-    ):
-        super().__init__(SlimHumanoid(sim_params, scale_inertia=scale_inertia), render_mode)
+    spec, xml, frame_skip = SLIM_HUMANOID, "humanoid.xml", 5
+    camera = Camera(distance=3.6, elevation=-8.0, height=0.9)
+
+    def initial_state(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Uniform noise of ±0.01 on positions and velocities; the quaternion normalised."""
+        qpos = self.nominal.qpos0 + rng.uniform(-0.01, 0.01, self.nominal.nq)
+        return _with_unit_quaternion(qpos), rng.uniform(-0.01, 0.01, self.nominal.nv)
+
+    def observe(self, state: RobotState) -> np.ndarray:
+        """Return positions but x and y, and velocities."""
+        return np.concatenate([state.qpos[..., 2:], state.qvel], axis=-1)
+
+    def reward(self, before: RobotState, action: np.ndarray, after: RobotState) -> np.ndarray:
+        """Forward velocity before the step, effort, and 5 for standing after it."""
+        height = after.qpos[..., 2]
+        standing = (height >= 1.0) & (height <= 2.0)
+        effort = np.square(action).sum(-1)
+        return 0.25 / 0.015 * before.qvel[..., 0] - 0.1 * effort + 5.0 * standing
 
 
-class HalfCheetahEnv(LocomotionEnv):
+class HalfCheetahTask(Task):
+    """Run forward.
+
+    reward = (x' - x) / 0.05 - 0.1 Σ a², the first term being the next observation's `obs[0]`.
+
+    `obs[0]` is predicted as it is, not as a difference, and is no feature; the pitch enters
+    as sine and cosine.
+
+    References:
+        Supplement A.1; released `half_cheetah_env.py`.
+    """
+
+    obs_size: ClassVar[int] = 18
+    action_size: ClassVar[int] = 6
+    action_low: ClassVar[tuple[float, ...]] = (-1.0,) * 6
+    action_high: ClassVar[tuple[float, ...]] = (1.0,) * 6
+
+    scale_inertia: bool = False
+    """Whether the mass scale applies to the rotational inertia too."""
+
+    def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
+        """Forward velocity over the step, and the effort."""
+        del obs
+        return next_obs[..., 0] - 0.1 * _effort(self.clip_action(action))
+
+    def released_reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
+        """As released: the velocity over the step before."""
+        del next_obs
+        return obs[..., 0] - 0.1 * _effort(self.unscale_action(action))
+
+    def preprocess(self, obs: Obs) -> Float[Array, "*batch features"]:
+        """Return z, sin pitch, cos pitch, then the joint angles and all velocities."""
+        pitch = obs[..., 2:3]
+        return jnp.concatenate(
+            [obs[..., 1:2], jnp.sin(pitch), jnp.cos(pitch), obs[..., 3:]], axis=-1
+        )
+
+    def target(self, obs: Obs, next_obs: Obs) -> Obs:
+        """Differences, and the average velocity itself."""
+        return (next_obs - obs).at[..., 0].set(next_obs[..., 0])
+
+    def postprocess(self, obs: Obs, delta: Obs) -> Obs:
+        """Undo `target`."""
+        return (obs + delta).at[..., 0].set(delta[..., 0])
+
+
+HALF_CHEETAH = EnvSpec(
+    name="half-cheetah",
+    env_id="headway/HalfCheetah-v0",
+    make_task=HalfCheetahTask,
+    sim_params=_mass_sets((0.25, 0.5, 1.5, 2.5), (0.1, 0.15), (2.75, 3.0)),
+    episode_length=1000,
+    default_sim_params={"mass_scale": 1.0, "damping_scale": 1.0},
+    options={"scale_inertia": False},
+    description="run forward on two legs with unknown masses",
+)
+
+
+class HalfCheetah(Robot):
     """Run forward with unknown masses.
 
     | What | Value |
@@ -190,17 +389,63 @@ class HalfCheetahEnv(LocomotionEnv):
     Source: supplement A.1 and released `half_cheetah_env.py`.
     """
 
-    def __init__(
-        self,
-        *,
-        scale_inertia: bool = False,
-        sim_params: SimParamSets | None = None,
-        render_mode: str | None = None,
-    ):
-        super().__init__(HalfCheetah(sim_params, scale_inertia=scale_inertia), render_mode)
+    spec, xml, frame_skip = HALF_CHEETAH, "half_cheetah.xml", 5
+    camera = Camera(distance=2.9, elevation=-12.0, height=0.45)
+
+    def initial_state(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Normal noise with standard deviation 0.001 on positions and velocities."""
+        qpos = self.nominal.qpos0 + rng.normal(0.0, 0.001, self.nominal.nq)
+        return qpos, rng.normal(0.0, 0.001, self.nominal.nv)
+
+    def observe(self, state: RobotState) -> np.ndarray:
+        """Return the average forward velocity, positions but x, and velocities."""
+        return np.concatenate([state.velocity[..., None], state.qpos[..., 1:], state.qvel], -1)
+
+    def reward(self, before: RobotState, action: np.ndarray, after: RobotState) -> np.ndarray:
+        """Forward velocity and the price of effort."""
+        del before
+        return after.velocity - 0.1 * np.square(action).sum(-1)
 
 
-class CrippledAntEnv(LocomotionEnv):
+class CrippledAntTask(Task):
+    """Walk forward on four legs, one of which does not obey.
+
+    reward = (x' - x) / 0.05 + 0.05, x being the torso's position (`obs[38]`); effort is free.
+
+    In single precision the difference of positions is exact only near the origin: the error
+    of the reward is about 1e-6 per metre of |x|.
+
+    References:
+        Supplement A.1; released `ant_cripple_env.py`.
+    """
+
+    obs_size: ClassVar[int] = 41
+    action_size: ClassVar[int] = 8
+    action_low: ClassVar[tuple[float, ...]] = (-1.0,) * 8
+    action_high: ClassVar[tuple[float, ...]] = (1.0,) * 8
+
+    shrink_leg: bool = False
+    """Whether the crippled leg is also half as long and thick."""
+
+    def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
+        """Forward velocity of the torso over the step, and a constant for being alive."""
+        del action
+        return (next_obs[..., 38] - obs[..., 38]) / 0.05 + 0.05
+
+
+CRIPPLED_ANT = EnvSpec(
+    name="crippled-ant",
+    env_id="headway/CrippledAnt-v0",
+    make_task=CrippledAntTask,
+    sim_params=SimParamSets({"crippled_leg": (0.0, 1.0, 2.0)}, {"leg-3": {"crippled_leg": (3.0,)}}),
+    episode_length=1000,
+    default_sim_params={"crippled_leg": -1.0},
+    options={"shrink_leg": False},
+    description="walk on four legs, one of which does not obey",
+)
+
+
+class CrippledAnt(Robot):
     """Walk on four legs, one of which does not obey.
 
     | What | Value |
@@ -219,11 +464,87 @@ class CrippledAntEnv(LocomotionEnv):
     learning_to_adapt. The torso's pose is taken from the state after the step.
     """
 
-    def __init__(
-        self,
-        *,
-        shrink_leg: bool = False,
-        sim_params: SimParamSets | None = None,
-        render_mode: str | None = None,
-    ):
-        super().__init__(CrippledAnt(sim_params, shrink_leg=shrink_leg), render_mode)
+    spec, xml, frame_skip = CRIPPLED_ANT, "ant.xml", 5
+    camera = Camera(distance=3.4, elevation=-40.0, height=0.3)
+    choices: ClassVar[Mapping[str, tuple[float, ...]]] = {"crippled_leg": (-1, 0, 1, 2, 3)}
+    leg_geoms = (
+        ("left_leg_geom", "left_ankle_geom"),
+        ("right_leg_geom", "right_ankle_geom"),
+        ("back_leg_geom", "third_ankle_geom"),
+        ("rightback_leg_geom", "fourth_ankle_geom"),
+    )
+    """Upper and lower part of each leg."""
+    # Leg i obeys the i-th of these pairs of actuators; the last row serves leg -1: all obey.
+    obeying = np.vstack([np.repeat(np.arange(4) != pair, 2) for pair in (1, 2, 3, 0, -1)])
+
+    def initial_state(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Noise U(±0.1) on positions, 0.1 N(0, 1) on velocities; the quaternion normalised."""
+        qpos = self.nominal.qpos0 + rng.uniform(-0.1, 0.1, self.nominal.nq)
+        qvel = 0.1 * rng.standard_normal(self.nominal.nv)
+        return _with_unit_quaternion(qpos), qvel
+
+    def set_physics(self, model: Any, sim_params: Mapping[str, float]) -> None:
+        """Colour the crippled leg and, if asked for, halve its capsules."""
+        for name in ("geom_size", "geom_pos", "geom_rgba"):
+            getattr(model, name)[:] = getattr(self.nominal, name)
+        leg = int(sim_params["crippled_leg"])
+        if leg < 0:
+            return
+        upper, lower = (model.geom(name).id for name in self.leg_geoms[leg])
+        model.geom_rgba[[upper, lower]] = GREY
+        if self.task.shrink_leg:
+            model.geom_size[[upper, lower]] *= 0.5
+            model.geom_pos[lower] = model.geom_pos[upper]
+
+    def control(self, action: np.ndarray, sim_params: Mapping[str, Any]) -> np.ndarray:
+        """Silence the two motors of the crippled leg."""
+        return action * self.obeying[np.asarray(sim_params["crippled_leg"], int)]
+
+    def observe(self, state: RobotState) -> np.ndarray:
+        """Return positions, velocities, the torso's rotation matrix and its position."""
+        w, x, y, z = np.moveaxis(state.qpos[..., 3:7], -1, 0)
+        rows = (
+            (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            (2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)),
+            (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
+        )
+        rotation = np.stack([entry for row in rows for entry in row], axis=-1)
+        return np.concatenate([state.qpos, state.qvel, rotation, state.qpos[..., :3]], axis=-1)
+
+    def reward(self, before: RobotState, action: np.ndarray, after: RobotState) -> np.ndarray:
+        """Forward velocity and a constant; effort is free."""
+        del before, action
+        return after.velocity + 0.05
+
+
+def _with_unit_quaternion(qpos: np.ndarray) -> np.ndarray:
+    """Normalise the free joint's quaternion, as MuJoCo 2.0 did in place."""
+    qpos[3:7] /= np.linalg.norm(qpos[3:7])
+    return qpos
+
+
+@functools.cache
+def load_model(xml: str) -> Any:
+    """Compile one of Gymnasium's MuJoCo models.
+
+    The half cheetah asks the compiler for a total mass, which MuJoCo deprecates with a
+    warning on the terminal; the same is done here after compiling.
+    """
+    import mujoco
+
+    from headway.envs import rendering
+
+    found = importlib.util.find_spec("gymnasium")
+    assert found is not None
+    assert found.origin is not None
+    path = Path(found.origin).parent / "envs" / "mujoco" / "assets" / xml
+    spec = mujoco.MjSpec.from_file(str(path))
+    total_mass = spec.compiler.settotalmass
+    spec.compiler.settotalmass = -1
+    rendering.restyle(spec)
+    model = spec.compile()
+    rendering.paint(model)
+    if total_mass > 0:
+        mujoco.mj_setTotalmass(model, total_mass)
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model

@@ -23,7 +23,7 @@ from headway.planning.flop import plan_flop
 from headway.sim_params import SimParamSets
 from headway.storage.progress_store import ProgressStore
 from headway.storage.tables import EpisodeRow
-from headway.tasks.base import Task
+from headway.task import Task
 from headway.training.progress import Progress
 
 GROUP_SEEDS = 1000  # seeds reserved for each group, so that groups never share an episode

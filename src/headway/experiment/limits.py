@@ -10,7 +10,7 @@ from headway.config import Config
 from headway.errors import LimitError
 from headway.experiment.methods import told_sim_params
 from headway.models.dynamics import context_layer, context_size
-from headway.tasks.base import Task
+from headway.task import Task
 
 PROCESS = 650 * 2**20  # Python, JAX, a simulator and compiled code, measured
 WORKER = 120 * 2**20  # a process with an environment, its simulator included, measured

@@ -12,8 +12,7 @@ from headway.experiment.rollouts import Arena
 from headway.planning.acting import Acting
 from headway.storage import arrays
 from headway.storage.run_dir import RunDir
-from headway.tasks.base import Task
-from headway.tasks.catalog import env_options, env_spec, episode_length
+from headway.task import Task, env_options, env_spec, episode_length
 
 
 def need_of(config: Config) -> MemoryNeed:

@@ -12,7 +12,7 @@ from headway.config.unused import unused_settings
 from headway.errors import ConfigError, unknown_name
 from headway.experiment.presets import PRESETS, Settings
 from headway.settings import TOLERANCE, flatten, override, setting_names, to_dict
-from headway.tasks.catalog import env_spec, sim_param_sets
+from headway.task import env_spec, sim_param_sets
 
 
 @dataclasses.dataclass(frozen=True)

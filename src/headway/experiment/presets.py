@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from headway.tasks.catalog import EnvSpec
+from headway.task import EnvSpec
 
 Settings = Mapping[str, Any]
 """Values by dotted name."""

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from headway.config import Config
 from headway.errors import ConfigError
 from headway.storage.tables import EpisodeRow
-from headway.tasks.catalog import env_options, env_spec, episode_length
+from headway.task import env_options, env_spec, episode_length
 
 _PENDULUM = {  # length: (random, ceiling), 200 steps
     0.25: (-1748.0, -539.0),

@@ -20,8 +20,7 @@ from headway.experiment.bad_episodes import Watch
 from headway.planning.acting import Acting
 from headway.planning.controller import env_action
 from headway.sim_params import SimParamSets
-from headway.tasks.base import Task
-from headway.tasks.catalog import EnvSpec, env_options, env_spec, episode_length, sim_param_sets
+from headway.task import EnvSpec, Task, env_options, env_spec, episode_length, sim_param_sets
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv

@@ -16,9 +16,9 @@ from jax.experimental import io_callback
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.config import PlannerConfig
+from headway.envs.built_in import ClassicVectorEnv, RobotVectorEnv
 from headway.envs.classic import ClassicWorld
 from headway.envs.futures import RobotFutures
-from headway.envs.vector_worlds import ClassicVectorEnv, RolloutVectorEnv
 from headway.errors import ConfigError
 from headway.experiment.rollouts import Arena
 from headway.planning.acting import Decision, Physics
@@ -27,7 +27,7 @@ from headway.planning.devices import brought_to_each, whole_on_each
 from headway.planning.imagination import over_rows
 from headway.planning.optimizers import Plan, SearchState, make_optimizer
 from headway.planning.step import scoring
-from headway.tasks.base import Task
+from headway.task import Task
 
 
 @runtime_checkable
@@ -97,7 +97,7 @@ def make_simulator(arena: Arena, planner: PlannerConfig) -> Simulator:
     """
     if isinstance(arena.vector, ClassicVectorEnv):
         return ClassicSimulator(arena.vector, arena.task, planner)
-    if isinstance(arena.vector, RolloutVectorEnv):
+    if isinstance(arena.vector, RobotVectorEnv):
         return RobotSimulator(arena.vector, arena.task, planner)
     raise ConfigError(
         f"{arena.spec.name} has no simulator to plan with, allowed: the built-in environments;"
@@ -201,7 +201,7 @@ class RobotSimulator:
         planner: Settings of the planner.
     """
 
-    def __init__(self, vector: RolloutVectorEnv, task: Task, planner: PlannerConfig):
+    def __init__(self, vector: RobotVectorEnv, task: Task, planner: PlannerConfig):
         self.task = task
         self._planner = planner
         self._futures = RobotFutures(vector)

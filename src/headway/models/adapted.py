@@ -19,7 +19,7 @@ from headway.models.dynamics import Statistics, network_input
 from headway.models.fitting import FitData
 from headway.models.networks import Dense
 from headway.models.updates import EpochStats, Fitted, Tally
-from headway.tasks.base import Task
+from headway.task import Task
 
 
 class ReluNet(eqx.Module):

@@ -26,7 +26,7 @@ from headway.models.networks import (
     swish,
 )
 from headway.models.products import row_by_row
-from headway.tasks.base import Task
+from headway.task import Task
 
 
 class Prediction(NamedTuple):

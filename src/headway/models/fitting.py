@@ -29,7 +29,7 @@ from headway.models.losses import (
 from headway.models.relation import add_parts, intervene, relation_gradient, relation_parts
 from headway.models.shuffling import permutations
 from headway.models.updates import EpochStats, unless_broken
-from headway.tasks.base import Task
+from headway.task import Task
 
 
 class FitState(eqx.Module):

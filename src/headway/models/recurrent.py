@@ -17,7 +17,7 @@ from headway.models.compilation import jit_networks
 from headway.models.fitting import FitData
 from headway.models.networks import Dense
 from headway.models.updates import EpochStats, Fitted, Tally
-from headway.tasks.base import Task
+from headway.task import Task
 
 FORGET_BIAS = 1.0
 

@@ -25,7 +25,7 @@ from headway.models.dynamics import (
 )
 from headway.models.losses import HIDDEN_DECAY, sum_of_squares, weight_decay_loss
 from headway.models.networks import Dense, swish
-from headway.tasks.base import Task
+from headway.task import Task
 
 
 class RelationParts(eqx.Module):

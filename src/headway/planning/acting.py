@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from headway.tasks.base import Task
+from headway.task import Task
 
 Physics = Sequence[Mapping[str, float]]
 """Simulator parameters of each environment, by name."""

@@ -20,7 +20,7 @@ from headway.planning.last_layer.learning import Learned, learn
 from headway.planning.last_layer.regression import Prior
 from headway.planning.optimizers import Plan, SearchState, make_optimizer, where_env
 from headway.planning.search import act
-from headway.tasks.base import Task
+from headway.task import Task
 
 
 class AgentState(NamedTuple):

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from headway.errors import ConfigError, shown
 from headway.models.networks import Normalizer
-from headway.tasks.base import Task
+from headway.task import Task
 
 CONSTANT = 0.01
 """How far a feature that never varied in training may be off, relative to its value or to 1."""

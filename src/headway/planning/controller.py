@@ -19,7 +19,7 @@ from headway.planning.checking import RangeCheck, in_bounds, not_finite, one_row
 from headway.planning.deadline import DeadlinePlanner
 from headway.planning.devices import brought_to_each
 from headway.planning.step import Planning, hold
-from headway.tasks.base import Task
+from headway.task import Task
 
 
 class Status(NamedTuple):

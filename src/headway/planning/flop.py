@@ -4,7 +4,7 @@ import itertools
 
 from headway.config import ModelConfig, PlannerConfig
 from headway.planning.optimizers import make_optimizer
-from headway.tasks.base import Task
+from headway.task import Task
 
 
 def plan_flop(

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from headway.config import PlannerConfig
 from headway.data import History
 from headway.models.dynamics import MultiHeadDynamics, Statistics, network_input
-from headway.tasks.base import Task
+from headway.task import Task
 
 ERROR_DRAWS = 20  # noise draws of the released code's sampled error
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from headway.models.dynamics import GaussianNet, MultiHeadDynamics, Statistics
 from headway.models.networks import Dense, DenseHeads, swish
 from headway.models.products import PRECISIONS, rounded
-from headway.tasks.base import Task
+from headway.task import Task
 
 Correction = Float[Array, "env member head feature obs"]
 

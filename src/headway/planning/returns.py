@@ -12,7 +12,7 @@ from headway.config import PlannerConfig
 from headway.planning.devices import SHARE_BUDGET, environments_at_once, spread_candidates
 from headway.planning.imagination import over_rows
 from headway.planning.noise import normal_block
-from headway.tasks.base import Task
+from headway.task import Task
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,7 +19,7 @@ from headway.config import PlannerConfig
 from headway.cpus import num_cpus
 from headway.models.compilation import in_each_precision
 from headway.planning.returns import Dynamics, RolloutSettings, Share, candidate_returns
-from headway.tasks.base import Task
+from headway.task import Task
 
 LEAST = 5_000
 """Imagined steps of an iteration that a share must have to be worth its while."""

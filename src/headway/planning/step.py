@@ -10,7 +10,7 @@ from headway.planning.acting import Acting, Decision
 from headway.planning.devices import whole_on_each
 from headway.planning.optimizers import Plan, Score, SearchState, make_optimizer
 from headway.planning.returns import Dynamics, RolloutSettings, candidate_returns
-from headway.tasks.base import Task
+from headway.task import Task
 
 
 class Known(Protocol):

@@ -25,7 +25,7 @@ from headway.planning.agent import Agent
 from headway.report.physics import distinct, full_label, varying
 from headway.report.tables import new_table
 from headway.storage.run_dir import RunDir
-from headway.tasks.catalog import sim_param_sets
+from headway.task import sim_param_sets
 from headway.training.progress import Progress
 
 Facts = dict[str, Any]

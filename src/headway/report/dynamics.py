@@ -15,7 +15,7 @@ from headway.errors import BadEnvironmentError, ConfigError
 from headway.report.obs_names import obs_names
 from headway.report.physics import SimParams, full_label, varying
 from headway.report.style import INK, THREAD, figure, label_axis, legend
-from headway.tasks.catalog import EnvSpec, env_spec
+from headway.task import EnvSpec, env_spec
 
 
 @dataclasses.dataclass(frozen=True)

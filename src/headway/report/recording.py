@@ -10,7 +10,7 @@ import numpy as np
 
 from headway.config import Config
 from headway.envs import make
-from headway.envs.schedule import Schedule
+from headway.envs.vector import Schedule
 from headway.errors import BadEnvironmentError, ConfigError
 from headway.experiment.loading import load_agent
 from headway.experiment.methods import config_to_evaluate
@@ -19,7 +19,7 @@ from headway.report import film
 from headway.report.film import Moment
 from headway.storage import files
 from headway.storage.run_dir import RunDir
-from headway.tasks.catalog import env_options, episode_length
+from headway.task import env_options, episode_length
 from headway.training.progress import Progress
 
 

@@ -14,7 +14,7 @@ from headway.experiment.references import mean_score, score_of
 from headway.report.physics import axis_label, distinct, full_label, value_label, varying
 from headway.settings import flatten, to_dict
 from headway.storage.tables import EpisodeRow
-from headway.tasks.catalog import EnvSpec, env_names, env_spec
+from headway.task import EnvSpec, env_names, env_spec
 
 Facts = dict[str, Any]
 

@@ -14,7 +14,7 @@ from headway.storage.run_dir import RunDir
 from headway.sweeps.board import first_status
 from headway.sweeps.jobs import Job
 from headway.sweeps.status import State
-from headway.tasks.catalog import episode_length, sim_param_sets
+from headway.task import episode_length, sim_param_sets
 
 PER_PRODUCT = 3.0  # a run takes about so much longer than its matrix products alone
 _SIZE, _PRODUCTS = 768, 12  # matrices that are multiplied to time this machine

@@ -18,7 +18,7 @@ from headway.experiment.methods import make_config
 from headway.storage.run_dir import RunDir
 from headway.sweeps import results_folder
 from headway.sweeps.experiments import Arm, Experiment, Settings
-from headway.tasks.catalog import env_spec
+from headway.task import env_spec
 
 
 class Cell(NamedTuple):

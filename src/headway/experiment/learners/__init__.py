@@ -9,7 +9,7 @@ from headway.experiment.learners.base import Learned as Learned
 from headway.experiment.learners.base import Learner as Learner
 from headway.experiment.learners.multi_headed import MultiHeaded
 from headway.experiment.learners.untrained import Random, Simulator
-from headway.tasks.base import Task
+from headway.task import Task
 
 _LEARNERS: dict[str, type[Learner]] = {
     "multi-headed": MultiHeaded,

@@ -16,7 +16,7 @@ from headway.models.fitting import FitData, make_data
 from headway.models.updates import EpochStats
 from headway.planning.acting import Acting
 from headway.settings import override
-from headway.tasks.base import Task
+from headway.task import Task
 
 
 class Learned(NamedTuple):

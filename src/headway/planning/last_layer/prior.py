@@ -19,7 +19,7 @@ from headway.planning.last_layer import foresight
 from headway.planning.last_layer.evidence import Evidence
 from headway.planning.last_layer.regression import Prior, Shape
 from headway.planning.last_layer.residuals import Onlooker, Rank
-from headway.tasks.base import Task
+from headway.task import Task
 
 MAX_EPISODES = 100
 """Episodes that are looked at, evenly spread over those collected; the paper's are all."""

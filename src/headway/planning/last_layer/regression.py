@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from headway.data import Episodes
 from headway.models.dynamics import MultiHeadDynamics, Statistics, network_input
-from headway.tasks.base import Task
+from headway.task import Task
 
 BELIEVABLE = 100.0
 """Deviations of the training data's deltas; larger residuals of a head count as this large, and

@@ -16,7 +16,7 @@ from headway.planning.last_layer.regression import (
     heads_by_error,
     see_episode,
 )
-from headway.tasks.base import Task
+from headway.task import Task
 
 Rank = Literal["owner", "runner-up"]
 

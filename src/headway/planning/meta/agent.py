@@ -16,7 +16,7 @@ from headway.planning.meta.models import AdaptiveModel, Transition
 from headway.planning.optimizers import Plan, SearchState, make_optimizer
 from headway.planning.returns import Dynamics, follow
 from headway.planning.search import act
-from headway.tasks.base import Task
+from headway.task import Task
 
 
 class AdaptiveState(NamedTuple):

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from headway.planning.imagination import over_rows
 from headway.planning.meta.models import Transition
-from headway.tasks.base import Task
+from headway.task import Task
 
 Predict = Callable[[Any, Array, Array], Array]
 """Parameters, observations [..., obs] and actions in [-1, 1] [..., action] to next observations."""

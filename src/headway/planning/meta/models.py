@@ -17,7 +17,7 @@ from headway.planning.heads import RecentTransitions
 from headway.planning.imagination import Layer, over_rows, plan_layers
 from headway.planning.optimizers import where_env
 from headway.planning.returns import Dynamics
-from headway.tasks.base import Task
+from headway.task import Task
 
 
 class Transition(NamedTuple):

@@ -11,7 +11,7 @@ from headway.storage.run_dir import RunDir
 from headway.storage.tables import format_sim_params
 from headway.sweeps.board import first_status
 from headway.sweeps.jobs import Cell, Comparison, Job
-from headway.tasks.catalog import env_options, episode_length, sim_param_sets
+from headway.task import env_options, episode_length, sim_param_sets
 
 COLLECTED = "collected"
 

@@ -11,7 +11,7 @@ from headway.config.unused import OPTIMIZER_SETTINGS
 from headway.experiment.references import mean_score, normalised, score_of
 from headway.report.page.runs import LoadedRun, Note
 from headway.storage.tables import EpisodeRow, format_sim_params
-from headway.tasks.catalog import env_names, env_options, episode_length
+from headway.task import env_names, env_options, episode_length
 
 RANDOM = "random"
 CEILING = "true-dynamics"

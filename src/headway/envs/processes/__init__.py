@@ -1,1 +1,0 @@
-"""Environments in processes of their own, which can be given up."""

@@ -1,0 +1,246 @@
+"""Tasks and the table of environments: all that a model and a planner must know of one, in JAX."""
+
+import abc
+import dataclasses
+import functools
+import importlib
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from headway.errors import ConfigError, unknown_name
+from headway.sim_params import SimParamSets
+
+if TYPE_CHECKING:
+    from headway.config import Config
+
+Obs = Float[Array, "*batch obs"]
+Action = Float[Array, "*batch action"]
+Reward = Float[Array, "*batch"]
+Ends = Bool[Array, "*batch"]
+
+
+class Task(eqx.Module):
+    """The reward, the end of an episode, and how observations enter and leave a model.
+
+    Every method is pure JAX and written for one transition with any number of leading
+    axes. `action` is always in the environment's own units; the model and the planner work
+    with actions scaled to [-1, 1] and convert with `scale_action`.
+
+    Subclasses state the sizes as class variables (a property where an option changes one)
+    and override what differs from the plain case: preprocess = identity, target =
+    next_obs - obs, no termination. Options of an environment are fields of its Task.
+
+    Example:
+        A point pushed along a line, which should stay at zero:
+
+        >>> class LineTask(Task):
+        ...     obs_size: ClassVar[int] = 2
+        ...     action_size: ClassVar[int] = 1
+        ...     action_low: ClassVar[tuple[float, ...]] = (-1.0,)
+        ...     action_high: ClassVar[tuple[float, ...]] = (1.0,)
+        ...
+        ...     def reward(self, obs, action, next_obs):
+        ...         return -jnp.square(next_obs[..., 0])
+    """
+
+    obs_size: ClassVar[int]
+    action_size: ClassVar[int]
+    action_low: ClassVar[tuple[float, ...]]
+    action_high: ClassVar[tuple[float, ...]]
+
+    @abc.abstractmethod
+    def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
+        """Reward of a transition, equal to what `env.step` returns."""
+
+    def released_reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
+        """Reward that the released code plans with; differs where that lags or errs."""
+        return self.reward(obs, action, next_obs)
+
+    def terminated(self, obs: Obs, action: Action, next_obs: Obs) -> Ends:
+        """Mark transitions that end the episode for good. The paper's tasks never end."""
+        del action, next_obs
+        return jnp.zeros(obs.shape[:-1], dtype=bool)
+
+    def preprocess(self, obs: Obs) -> Float[Array, "*batch features"]:
+        """Turn an observation into the features that enter a network."""
+        return obs
+
+    def target(self, obs: Obs, next_obs: Obs) -> Obs:
+        """The regression target `delta` of a transition."""
+        return next_obs - obs
+
+    def postprocess(self, obs: Obs, delta: Obs) -> Obs:
+        """Undo `target`: `postprocess(obs, target(obs, next_obs)) == next_obs`."""
+        return obs + delta
+
+    def scale_action(self, action: Action) -> Action:
+        """Map an action from [-1, 1] to the environment's own units."""
+        low, high = jnp.asarray(self.action_low), jnp.asarray(self.action_high)
+        return low + 0.5 * (action + 1.0) * (high - low)
+
+    def unscale_action(self, action: Action) -> Action:
+        """Map an action from the environment's own units to [-1, 1]."""
+        low, high = jnp.asarray(self.action_low), jnp.asarray(self.action_high)
+        return 2.0 * (action - low) / (high - low) - 1.0
+
+    def clip_action(self, action: Action) -> Action:
+        """Limit an action in the environment's own units to its range, as the envs do."""
+        return jnp.clip(action, jnp.asarray(self.action_low), jnp.asarray(self.action_high))
+
+    @property
+    def feature_size(self) -> int:
+        """Width of `preprocess`'s result."""
+        return eqx.filter_eval_shape(self.preprocess, np.zeros(self.obs_size, np.float32)).shape[-1]
+
+
+@dataclasses.dataclass(frozen=True)
+class EnvSpec:
+    """Name, physics and scale of an environment, and how its Task is made.
+
+    Raises:
+        ConfigError: It contradicts itself.
+    """
+
+    name: str
+    """Short name, as the command line takes it."""
+    env_id: str
+    """Gymnasium id; any id that `gymnasium.make` knows."""
+    make_task: Callable[..., Task]
+    """Builds the Task; takes the options as keywords."""
+    sim_params: SimParamSets
+    """Physics to train on and to test on; passed to `reset` as `options["sim_params"]`."""
+    episode_length: int
+    """Steps after which an episode is cut."""
+    default_sim_params: Mapping[str, float]
+    """The physics of the unchanged environment."""
+    options: Mapping[str, bool] = dataclasses.field(default_factory=dict)
+    """Boolean options of the environment and its Task, with their defaults."""
+    description: str = ""
+    """One line for lists."""
+    epochs: int = 50
+    """Passes over the data per iteration at the paper's scale (supplement A.2)."""
+    noise_beta: float | None = None
+    """Exponent of the power spectrum of the noise with which iCEM searches in the preset `fast`;
+    None searches with CEM, whose noise is white."""
+
+    def __post_init__(self) -> None:
+        if not self.name or self.episode_length < 1 or self.epochs < 1:
+            raise ConfigError(
+                f"environment {self.name!r} has episode_length {self.episode_length} and epochs"
+                f" {self.epochs}, allowed: a name, and at least 1 each."
+            )
+        if set(self.default_sim_params) != set(self.sim_params.names):
+            raise ConfigError(
+                f"environment {self.name!r} has default_sim_params for"
+                f" {sorted(self.default_sim_params)}, allowed: exactly those of its sim_params,"
+                f" {sorted(self.sim_params.names)}."
+            )
+
+
+_HOMES = {
+    "pendulum": "headway.envs.classic:PENDULUM",
+    "cartpole-swingup": "headway.envs.classic:CARTPOLE_SWINGUP",
+    "hopper": "headway.envs.locomotion:HOPPER",
+    "slim-humanoid": "headway.envs.locomotion:SLIM_HUMANOID",
+    "half-cheetah": "headway.envs.locomotion:HALF_CHEETAH",
+    "crippled-ant": "headway.envs.locomotion:CRIPPLED_ANT",
+}
+BUILT_IN: tuple[str, ...] = tuple(_HOMES)
+"""Names of the paper's six environments."""
+_registered: dict[str, EnvSpec] = {}
+
+
+def register(spec: EnvSpec) -> None:
+    """Add an environment of your own, or replace an earlier one of the same name.
+
+    Its `reset` must take `options={"sim_params": {name: value}}`, and the environment must
+    take the options as keywords.
+
+    Raises:
+        ConfigError: The spec has the name of a built-in environment.
+    """
+    if spec.name in BUILT_IN:
+        raise ConfigError(
+            f"environment name {spec.name!r} is taken, allowed: any but {', '.join(BUILT_IN)}."
+        )
+    _registered[spec.name] = spec
+
+
+def env_names() -> list[str]:
+    """Return the short names of the built-in and the registered environments."""
+    return [*BUILT_IN, *_registered]
+
+
+def env_spec(name: str) -> EnvSpec:
+    """Look an environment up.
+
+    Args:
+        name: A short name, a Gymnasium id, or `"my_package:cart"`: the EnvSpec `cart` of the
+            module `my_package`, or a function of that name that returns one.
+
+    Raises:
+        UnknownNameError: No such environment.
+        ConfigError: The module cannot be imported.
+    """
+    if name in BUILT_IN:
+        return _imported(_HOMES[name])
+    if name in _registered:
+        return _registered[name]
+    specs = [env_spec(known) for known in env_names()]
+    for spec in specs:
+        if name == spec.env_id:
+            return spec
+    if ":" in name:
+        if str(Path.cwd()) not in sys.path:  # a console script does not look there
+            sys.path.append(str(Path.cwd()))
+        return dataclasses.replace(_imported(name), name=name)
+    raise unknown_name(
+        "environment", name, [spec.env_id for spec in specs] if "/" in name else env_names()
+    )
+
+
+@functools.cache
+def _imported(path: str) -> EnvSpec:
+    """Return what `module:name` means."""
+    module_name, _, name = path.partition(":")
+    try:
+        module = importlib.import_module(module_name)
+    except Exception as error:  # whatever the module does while it is imported
+        reason = " ".join(str(error).split())[:300]
+        raise ConfigError(
+            f"environment {path!r}: importing {module_name!r} raised {type(error).__name__}"
+            f" ({reason}), allowed: module:name of a module that Python finds from here."
+        ) from error
+    if not hasattr(module, name):
+        known = [key for key, value in vars(module).items() if isinstance(value, EnvSpec)]
+        raise unknown_name(f"environment of {module_name}", name, known)
+    found = getattr(module, name)
+    spec = found() if callable(found) else found
+    if not isinstance(spec, EnvSpec):
+        raise ConfigError(
+            f"environment {path!r} is {type(spec).__name__}, allowed: an EnvSpec, or a function"
+            " without arguments that returns one."
+        )
+    return spec
+
+
+def episode_length(config: "Config") -> int:
+    """Steps of an episode: the run's own, or else the environment's."""
+    return config.collection.episode_length or env_spec(config.env).episode_length
+
+
+def env_options(config: "Config") -> dict[str, bool]:
+    """All options of a run's environment: its own over the defaults."""
+    return {**env_spec(config.env).options, **config.env_options}
+
+
+def sim_param_sets(config: "Config") -> SimParamSets:
+    """Training and unseen physics: the run's own, or else the environment's."""
+    return config.sim_params or env_spec(config.env).sim_params
