@@ -1,3 +1,6 @@
+# pyright: reportAttributeAccessIssue=false
+# (the names compiled into mujoco have no stubs)
+
 """Hopper, SlimHumanoid, HalfCheetah and CrippledAnt: Task, laws and physics.
 
 The formulas are NumPy on arrays with any number of leading axes. The models are the XML

@@ -144,8 +144,8 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         rewards = np.zeros(self.num_envs)
         next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
         # Without autoreset a finished environment stands still: same flags, reward 0.
-        terminated, truncated = self._ends & (not next_step)
-        finished = self._ends.any(0)
+        terminated, truncated = np.zeros_like(self._ends) if next_step else self._ends.copy()
+        finished: np.ndarray = self._ends.any(0)
         restart = finished & next_step
         if restart.any():
             nothing = [{}] * self.num_envs
@@ -395,7 +395,7 @@ class SequentialVectorEnv(HeadwayVectorEnv):
                     f"an environment returned the reward {reward!r}, allowed: a number; correct"
                     " the environment."
                 ) from None
-        return Outcome(rewards, *ends, broken)
+        return Outcome(rewards, ends[0], ends[1], broken)
 
     def _check_spaces(self, spaces: tuple[gymnasium.Space, gymnasium.Space]) -> None:
         allowed = self.single_observation_space, self.single_action_space
@@ -522,9 +522,8 @@ class ProcessVectorEnv(SequentialVectorEnv):
                 found[i] = BrokenEpisodeError(why)
             except (EOFError, OSError):
                 env.processes[0].join()
-                code = env.processes[0].exitcode
-                killed = code is not None and code < 0
-                how = f"killed by {signal.Signals(-code).name}" if killed else f"over ({code})"
+                code = env.processes[0].exitcode or 0
+                how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"over ({code})"
                 found[i] = BrokenEpisodeError(f"had its process {how} during {method}")
             except BrokenEpisodeError as error:
                 found[i] = error
