@@ -145,7 +145,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
         # Without autoreset a finished environment stands still: same flags, reward 0.
         terminated, truncated = np.zeros_like(self._ends) if next_step else self._ends.copy()
-        finished: np.ndarray = self._ends.any(0)
+        finished = np.asarray(self._ends.any(0))
         restart = finished & next_step
         if restart.any():
             nothing = [{}] * self.num_envs
