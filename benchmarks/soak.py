@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from headway.errors import PlanningError
-from headway.experiment.loading import initial, learner_of, load_task
+from headway.training.loading import initial, learner_of, load_task
 from headway.experiment.methods import make_config
 from headway.planning import agent as agent_module
 from headway.planning.controller import Controller

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from summarise import Means, last_rows, of_run
 
-from headway.experiment.references import normalised
-from headway.storage.tables import EpisodeRow, format_sim_params
+from headway.training.references import normalised
+from headway.training.run import EpisodeRow, format_sim_params
 
 Scores = dict[bool, list[float]]
 """One score per seed, over training (False) and over unseen physics (True)."""

@@ -18,8 +18,8 @@ from headway import settings
 from headway.config import Config
 from headway.experiment.methods import make_config
 from headway.storage.iterations import manifest_name
-from headway.storage.run_dir import RunDir
-from headway.storage.tables import TABLES
+from headway.training.run import RunDir
+from headway.training.run import TABLES
 from headway.sweeps.jobs import fingerprint
 
 

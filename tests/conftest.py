@@ -12,12 +12,16 @@ jaxtyping.install_import_hook(
     "beartype.beartype",
 )
 
+import shutil  # noqa: E402
+from pathlib import Path  # noqa: E402
+
 import jax  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
-from headway.experiment.limits import resident  # noqa: E402
+import runs  # noqa: E402
 from headway.models.compilation import prepare_jax  # noqa: E402
+from headway.training.train import train_run  # noqa: E402
 
 settings.register_profile(
     "headway",
@@ -30,11 +34,40 @@ settings.load_profile("headway")
 
 prepare_jax()
 MUCH = 3 * 2**30  # bytes
+STATM = Path("/proc/self/statm")
+PAGE = 4096
 
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_compiled_programs():
     """Keep a worker below a few GiB: JAX holds on to every program that it compiled."""
     yield
-    if resident() > MUCH:
+    if STATM.exists() and int(STATM.read_text().split()[1]) * PAGE > MUCH:
         jax.clear_caches()
+
+
+class _StoppingAfterTwo(runs.Progress):
+    def iteration_done(self, metrics):
+        if metrics["iteration"] == 1:
+            raise KeyboardInterrupt
+
+
+@pytest.fixture(scope="session")
+def reference(tmp_path_factory) -> Path:
+    """A tiny run that was never stopped; only to be read."""
+    return train_run(runs.tiny_config(), tmp_path_factory.mktemp("reference") / "run").path
+
+
+@pytest.fixture(scope="session")
+def two_iterations(tmp_path_factory) -> Path:
+    """The same run, stopped after two of three iterations; only to be read."""
+    path = tmp_path_factory.mktemp("two") / "run"
+    with pytest.raises(KeyboardInterrupt):
+        train_run(runs.tiny_config(), path, _StoppingAfterTwo())
+    return path
+
+
+@pytest.fixture
+def root(two_iterations, tmp_path) -> Path:
+    """A copy of that run, to be changed."""
+    return Path(shutil.copytree(two_iterations, tmp_path / "run"))

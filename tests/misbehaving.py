@@ -106,6 +106,12 @@ class Drift(gymnasium.Env):
     def speak(self):
         return np.array(["a", "b", "c"]), 1.0, False, False, {}
 
+    def lose_a_number(self):
+        return np.array([0.0, np.nan, 0.0]), 1.0, False, False, {}
+
+    def pay_too_much(self):
+        return self.position.copy(), np.inf, False, False, {}
+
     def count(self):
         return np.array([1, 2, 3]), 1, False, False, {}
 

@@ -11,11 +11,10 @@ import pytest
 from headway import api
 from headway.cli import COMMANDS, main, parse, read_seeds, read_settings
 from headway.errors import ConfigError, RunError
-from headway.experiment.evaluation import PlanningCost
 from headway.experiment.methods import METHODS, PRESETS, make_config
-from headway.storage.interrupts import Terminated
-from headway.storage.run_dir import RunDir
-from headway.storage.tables import EpisodeRow
+from headway.training.evaluate import PlanningCost
+from headway.training.run import EpisodeRow, RunDir
+from headway.training.stopping import Terminated
 
 
 def run(capsys, *words):
@@ -71,7 +70,8 @@ def calls(monkeypatch, tmp_path):
 def trained(tmp_path):
     """A run directory as far as its settings go."""
     run_dir = RunDir(tmp_path / "trained")
-    run_dir.create_or_resume(make_config("pendulum", preset="quick"))
+    run_dir.path.mkdir()
+    run_dir.begin(make_config("pendulum", preset="quick"))
     return str(run_dir.path)
 
 
@@ -184,7 +184,16 @@ def test_help_shows_the_values_that_settings_would_have(capsys, trained):
 
 
 def test_train_prints_a_table_the_figures_and_what_to_do_next(capsys, calls, tmp_path):
-    words = ("train", "pendulum", "--preset", "quick", "--seed", "3", "--ignore-limits", "--quiet")
+    words = (
+        "train",
+        "pendulum",
+        "--preset",
+        "quick",
+        "--seed",
+        "3",
+        "--resume-from-last-good",
+        "--quiet",
+    )
     code, out, err = run(capsys, *words)
     assert (code, err) == (0, "")
     for text in ("training", "length 0.5 m", "-1,091.0 ± 50.0", "1.00", str(tmp_path / "a.png")):
@@ -192,7 +201,7 @@ def test_train_prints_a_table_the_figures_and_what_to_do_next(capsys, calls, tmp
     assert f"headway evaluate {tmp_path / 'run'}" in out
     assert f"headway {' '.join(words)}" in out
     assert (calls[0]["seed"], calls[0]["run_dir"], calls[0]["settings"]) == (3, None, {})
-    assert (calls[0]["resume_from_last_good"], calls[0]["ignore_limits"]) == (False, True)
+    assert calls[0]["resume_from_last_good"] is True
 
 
 def test_train_json_is_one_line(capsys, calls, tmp_path):

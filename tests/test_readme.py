@@ -16,9 +16,9 @@ from headway.cli import main
 from headway.config import model
 from headway.errors import ConfigError
 from headway.experiment import learners, methods
-from headway.experiment.loading import load_agent
 from headway.settings import setting_names
-from headway.storage.run_dir import RunDir
+from headway.training.loading import load_agent
+from headway.training.run import RunDir
 
 ROOT = Path(__file__).parent.parent
 

@@ -26,11 +26,11 @@ from measure import name_of
 
 from headway.config import Config
 from headway.data import Trajectory
-from headway.experiment.loading import load_agent
+from headway.training.loading import load_agent
 from headway.experiment.methods import config_to_evaluate
-from headway.experiment.rollouts import AgentPolicy, Arena, Episode, run_episodes
+from headway.training.collect import AgentPolicy, Environments, Episode, run_episodes
 from headway.storage.records import read_csv, write_csv
-from headway.storage.run_dir import RunDir
+from headway.training.run import RunDir
 
 COLUMNS = (
     "run", "env", "method", "seed", "arm", "settings", "step", "episode", "before", "after", "over",
@@ -148,12 +148,12 @@ def measure(
 def act(run: RunDir, config: Config, episodes: Sequence[Episode]) -> list[Trajectory]:
     """Run episodes with a trained run, as many side by side as its batch holds."""
     found = []
-    with closing(Arena.make(config)) as arena:
-        agent, size = load_agent(run, config, arena), arena.vector.num_envs
+    with closing(Environments.make(config)) as environments:
+        agent, size = load_agent(run, config, environments), environments.vector.num_envs
         for start in range(0, len(episodes), size):
             batch = episodes[start : start + size]
             policy = AgentPolicy(agent, size, batch, key=jax.random.key(SEED + start))
-            found += run_episodes(arena, batch, policy).trajectories
+            found += run_episodes(environments, batch, policy).trajectories
     return found
 
 

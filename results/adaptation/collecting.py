@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from headway.report import style
-from headway.storage.run_dir import RunDir
+from headway.training.run import RunDir
 
 Curves = dict[str, dict[int, list[float]]]
 """Of each method and seed: the mean return of every iteration's episodes."""

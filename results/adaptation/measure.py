@@ -19,8 +19,8 @@ from headway.config import Config
 from headway.report.tables import by_physics
 from headway.settings import override
 from headway.storage.records import read_csv, write_csv
-from headway.storage.run_dir import RunDir
-from headway.storage.tables import EVALUATION_COLUMNS, EpisodeRow
+from headway.training.run import RunDir
+from headway.training.run import EVALUATION_COLUMNS, EpisodeRow
 from headway.training.progress import make_progress
 
 COLUMNS = (

@@ -20,9 +20,9 @@ from go_on import copy_but_last_fit, finish
 from jaxtyping import Float, Int
 
 from headway.experiment.learners import Learned
-from headway.experiment.loading import load_learned
+from headway.training.loading import load_learned
 from headway.models.dynamics import MultiHeadDynamics
-from headway.storage.run_dir import RunDir
+from headway.training.run import RunDir
 
 Shares = Float[np.ndarray, "member head physics"]
 

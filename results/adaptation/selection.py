@@ -16,10 +16,10 @@ from measure import ARMS, name_of
 
 from headway.data import Trajectory
 from headway.experiment.methods import config_to_control
-from headway.experiment.testing import run_tests
+from headway.training.evaluate import run_tests
 from headway.report.diagnosis import examined
 from headway.storage.records import read_csv, write_csv
-from headway.storage.run_dir import RunDir
+from headway.training.run import RunDir
 
 COLUMNS = (
     "run", "env", "method", "seed", "rule", "group", "chosen_error", "best_error",

@@ -5,7 +5,6 @@ from .api import Run as Run
 from .api import evaluate as evaluate
 from .api import train as train
 from .config import Config as Config
-from .data import ReplayBuffer as ReplayBuffer
 from .data import Trajectory as Trajectory
 from .errors import BadEnvironmentError as BadEnvironmentError
 from .errors import BrokenEpisodeError as BrokenEpisodeError
@@ -44,12 +43,12 @@ from .report.recording import Recording as Recording
 from .report.recording import record as record
 from .service import load as load
 from .sim_params import SimParamSets as SimParamSets
-from .storage.run_dir import RunDir as RunDir
-from .storage.tables import EpisodeRow as EpisodeRow
 from .task import EnvSpec as EnvSpec
 from .task import Task as Task
 from .task import env_spec as env_spec
 from .task import register as register
+from .training.run import EpisodeRow as EpisodeRow
+from .training.run import RunDir as RunDir
 
 __all__: list[str]
 __version__: str

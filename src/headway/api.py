@@ -6,16 +6,15 @@ from pathlib import Path
 from typing import Any, overload
 
 from headway.config import Config
-from headway.experiment.evaluation import PlanningCost, episode_rows
 from headway.experiment.methods import make_config
-from headway.experiment.testing import run_tests
-from headway.experiment.training import train_run
 from headway.models.compilation import prepare_jax
 from headway.planning.controller import Controller
 from headway.report.figures import save_run_figures
 from headway.service import load
-from headway.storage.tables import EpisodeRow
+from headway.training.evaluate import PlanningCost, run_tests
 from headway.training.progress import Progress
+from headway.training.run import EpisodeRow
+from headway.training.train import train_run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +93,6 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
     settings: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
     resume_from_last_good: bool = False,
-    ignore_limits: bool = False,
 ) -> Run:
     """Train a controller on environments whose physics vary; resume if it was begun before.
 
@@ -108,13 +106,12 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
         progress: Shown while training; silent by default.
         resume_from_last_good: Where a file of the run is damaged, go back to the newest
             iteration whose files are all intact.
-        ignore_limits: Try what seems too large for the free memory.
 
     Raises:
         UnknownNameError: No such environment, method or preset.
         ConfigError: A setting is unknown, of the wrong type or out of range.
         RunError: The directory holds something else, is damaged, or in use.
-        LimitError: The run needs more memory than is free, or the disk is full.
+        LimitError: The disk is full; nothing is lost.
         BadEnvironmentError: The environment broke its contract.
         DivergenceError: Fitting lost all finite numbers.
     """
@@ -125,7 +122,6 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
         run_dir or default_run_dir(config),
         progress,
         resume_from_last_good=resume_from_last_good,
-        ignore_limits=ignore_limits,
     )
     return Run(run.path, config, run.metrics(), run.evaluation(), save_run_figures(run.path))
 
@@ -153,14 +149,13 @@ def evaluate(
         UnknownNameError: No such group.
         ConfigError: A setting is unknown, of the wrong type or out of range, or one that
             training has fixed.
-        LimitError: Planning needs more memory than is free.
     """
     prepare_jax()
     tested = run_tests(
         run_dir, groups=groups, num_episodes=num_episodes, settings=settings, progress=progress
     )
-    rows = episode_rows(tested.config, tested.iteration, tested.tests)
-    cost = PlanningCost.of(tested.use, tested.config, tested.arena.task)
+    rows = tested.tests.rows(tested.config, tested.iteration)
+    cost = PlanningCost.of(tested.tests.use, tested.config, tested.task)
     return Evaluation(rows, tested.config, cost)
 
 

@@ -130,8 +130,6 @@ class Train(Command):
     """Switches of the environment: NAME=on or NAME=off."""
     resume_from_last_good: Flag = False
     """Where a file of the run is damaged, go back to the newest iteration that is intact."""
-    ignore_limits: Flag = False
-    """Try what seems too large for the free memory."""
     model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
     fitting: FittingConfig = dataclasses.field(default_factory=FittingConfig)
     planner: PlannerConfig = dataclasses.field(default_factory=PlannerConfig)
@@ -189,7 +187,6 @@ class Train(Command):
             settings=settings,
             progress=self.progress(),
             resume_from_last_good=self.resume_from_last_good,
-            ignore_limits=self.ignore_limits,
         )
         last = max((row.iteration for row in run.evaluation), default=0)
         rows = [row for row in run.evaluation if row.iteration == last]
@@ -223,7 +220,7 @@ class _OfRun(Command):
 
     def config(self) -> Config:
         """Read the settings of the run."""
-        from headway.storage.run_dir import RunDir
+        from headway.training.run import RunDir
 
         return RunDir(self.run_dir).config()
 
@@ -309,7 +306,7 @@ class Record(_OfRun):
             schedule.setdefault(int(found[1]), {}).update(_physics([found[2]], "--schedule"))
         settings = self.changed(self.config())
         from headway.report import recording
-        from headway.storage.files import check_target
+        from headway.training.run import check_target
 
         check_target(self.output)
         film = recording.record(
@@ -376,7 +373,7 @@ class Report(Command):
     def run(self, words):
         """Write the page, and print where it is."""
         from headway.report.page.build import write_report
-        from headway.storage.files import check_target
+        from headway.training.run import check_target
 
         check_target(self.output)
         path = str(write_report(self.runs, self.output, only=self.only))
@@ -538,8 +535,8 @@ class PlotDynamics(Command):
         if self.num_states < 1:
             raise ConfigError(f"--num-states is {self.num_states}, allowed: at least 1.")
         from headway.report import dynamics
-        from headway.storage.files import check_target
         from headway.task import env_spec
+        from headway.training.run import check_target
 
         name = env_spec(self.env).name
         out = self.output or Path(f"{name}-dynamics.png")
@@ -690,7 +687,7 @@ def _json_or_text(word: str) -> Any:
 
 def _physics(words: Sequence[str], option: str) -> dict[str, float]:
     """Read `length=0.5 mass=2`."""
-    from headway.storage.tables import parse_sim_params
+    from headway.training.run import parse_sim_params
 
     try:
         return parse_sim_params(" ".join(words))

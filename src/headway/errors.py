@@ -52,7 +52,7 @@ class PlanningError(HeadwayError, RuntimeError):
 
 
 class LimitError(HeadwayError, RuntimeError):
-    """The machine lacks the memory or the disk that a run needs."""
+    """The machine lacks the disk that a run needs."""
 
 
 def shown(value: Any) -> str:

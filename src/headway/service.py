@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from headway.experiment.loading import load_agent
 from headway.experiment.methods import config_to_control
 from headway.models.compilation import prepare_jax
 from headway.planning.controller import Controller
-from headway.storage.run_dir import RunDir
+from headway.training.loading import load_agent
+from headway.training.run import RunDir
 
 
 def load(
@@ -31,7 +31,6 @@ def load(
         RunError: There is no trained run, or it is damaged.
         ConfigError: A setting is unknown, of the wrong type or out of range, or none of the
             planner's; or as `Controller`.
-        LimitError: The model needs more memory than is free.
     """
     prepare_jax()
     run = RunDir(run_dir)

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from test_training import contents, interrupt, untimed
 
 import headway
 from headway.errors import ConfigError
-from headway.experiment import training
 from headway.experiment.methods import make_config
+from headway.training import train
 
 TINY = {"collection.episode_length": 30, "fitting.epochs": 2}
 SPREAD = [
@@ -27,46 +26,12 @@ def test_smoke_run(method, env, tmp_path):
     assert np.isfinite([m["fitting"]["loss"] for m in run.metrics]).all()
     names = ["learning_curve.png", "evaluation.png", "prediction_error.png"]
     assert [path.name for path in run.figures] == names  # there are no heads to show
-    errors = training.RunDir(tmp_path).prediction_errors()
+    errors = train.RunDir(tmp_path).prediction_errors()
     assert {row["step"] for row in errors} == {1, 2, 3, 4}
     assert all(0 < row["error"] < np.inf for row in errors)
     controller = headway.load(tmp_path)
     controller.act(np.zeros(controller.agent.task.obs_size))
     assert controller.heads is None
-
-
-@pytest.mark.parametrize("method", ["grbal", "rebal"])
-@pytest.mark.parametrize("broken", ["fit", "evaluate"])
-def test_interrupted_run_resumes_to_the_same_end(method, broken, tmp_path, monkeypatch):
-    config = make_config("pendulum", method=method, preset="smoke", settings=TINY)
-    training.train_run(config, tmp_path / "whole")
-    interrupt(config, tmp_path / "cut", broken, monkeypatch)
-    training.train_run(config, tmp_path / "cut")
-    assert untimed(tmp_path / "cut") == untimed(tmp_path / "whole")
-    assert contents(tmp_path / "cut") == contents(tmp_path / "whole")
-
-
-@pytest.mark.parametrize("method", ["grbal", "rebal"])
-def test_a_fit_that_is_cut_between_epochs_goes_on(method, tmp_path, monkeypatch):
-    config = make_config("pendulum", method=method, preset="smoke", settings=TINY)
-    training.train_run(config, tmp_path / "whole")
-    check, calls = training.divergence, []
-
-    def interrupted(*args):
-        calls.append(args)
-        if len(calls) == 4:  # the second epoch of the second iteration
-            raise KeyboardInterrupt
-        return check(*args)
-
-    with monkeypatch.context() as patch:
-        patch.setattr("headway.storage.progress_store.EVERY", 0)
-        patch.setattr(training, "divergence", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            training.train_run(config, tmp_path / "cut")
-        patch.setattr(training, "divergence", lambda *args: calls.append(args) or check(*args))
-        training.train_run(config, tmp_path / "cut")
-    assert len(calls) == 5  # only the epoch that was cut is done again
-    assert contents(tmp_path / "cut") == contents(tmp_path / "whole")
 
 
 def test_sizes_are_the_papers_at_its_scale_and_smaller_in_smaller_presets():

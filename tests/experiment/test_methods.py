@@ -5,12 +5,12 @@ import dataclasses
 import pytest
 
 from headway.errors import ConfigError, UnknownNameError
-from headway.experiment.evaluation import group_episodes
 from headway.experiment.methods import METHODS, PRESETS, make_config
-from headway.experiment.references import score
 from headway.planning.flop import plan_flop
-from headway.storage.tables import format_sim_params, parse_sim_params
 from headway.task import env_names, env_spec
+from headway.training.evaluate import group_episodes
+from headway.training.references import score
+from headway.training.run import format_sim_params, parse_sim_params
 
 
 @pytest.mark.parametrize("env", env_names())

@@ -1,6 +1,5 @@
 """Methods that differ in the model: their settings, smoke runs, resuming, and what they learn."""
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,10 +8,10 @@ import pytest
 import headway
 import headway.envs
 from headway.data import Trajectory
-from headway.experiment import limits, loading, training
 from headway.experiment.methods import make_config, told_sim_params
 from headway.models.dynamics import network_input
 from headway.settings import differences
+from headway.training import loading, train
 
 NEW = ("stacked", "cadm", "pets-cadm", "oracle-params", "ria")
 TINY = {"collection.episode_length": 12, "fitting.epochs": 1}
@@ -77,57 +76,9 @@ ABLATIONS = [
 def test_ablations_of_the_supplement_are_settings(method, settings, tmp_path):
     tiny = {"collection.episode_length": 8, "fitting.epochs": 1, "planner.num_iterations": 1}
     config = make_config("pendulum", method=method, preset="smoke", settings={**tiny, **settings})
-    metrics = training.train_run(config, tmp_path / "run").metrics()
+    metrics = train.train_run(config, tmp_path / "run").metrics()
     assert np.isfinite([m["fitting"]["loss"] for m in metrics]).all()
     assert len(metrics) == 2
-
-
-@pytest.mark.parametrize("method", ["ria", "oracle-params"])
-def test_a_run_with_new_parts_resumes_where_it_was_stopped(method, tmp_path, monkeypatch):
-    config = make_config("pendulum", method=method, preset="smoke", settings=TINY)
-    whole = training.train_run(config, tmp_path / "whole")
-    stop_after = training.Trainer.run_iteration
-
-    class StoppedError(Exception):
-        pass
-
-    def stopped(trainer, iteration):
-        stop_after(trainer, iteration)
-        raise StoppedError
-
-    with monkeypatch.context() as patch:
-        patch.setattr(training.Trainer, "run_iteration", stopped)
-        with pytest.raises(StoppedError):
-            training.train_run(config, tmp_path / "parts")
-    parts = training.train_run(config, tmp_path / "parts")
-    for iteration in (0, 1):
-        first, second = (run.checkpoint(iteration).read_bytes() for run in (whole, parts))
-        assert first == second
-    assert whole.evaluation() == parts.evaluation()
-    controller = headway.load(parts.path)
-    env = gymnasium.make("headway/Pendulum-v0")
-    obs, info = env.reset(seed=1, options={"sim_params": {"length": 1.75}})
-    controller.reset(sim_params=info["sim_params"])
-    assert env.action_space.contains(controller.act(obs))
-
-
-@pytest.mark.parametrize("env", ["pendulum", "half-cheetah"])
-@pytest.mark.parametrize("method", NEW)
-def test_weights_of_every_method_are_counted(method, env):
-    config = make_config(env, method=method)
-    task = loading.load_task(config)
-    model = loading.eqx.filter_eval_shape(lambda: loading.initial(config, task)).fit.model
-    counted = sum(leaf.size for leaf in jax.tree.leaves(model))
-    assert counted == pytest.approx(limits.num_parameters(config, task), rel=0.1)
-
-
-def test_comparing_all_contexts_takes_memory():
-    pairs = {}
-    for method in ("pets-cadm", "ria"):
-        config = make_config("half-cheetah", method=method, settings={"fitting.batch_size": 1000})
-        task = loading.load_task(config)
-        pairs[method] = limits.memory_need(config, task, 1000).fitting
-    assert pairs["ria"] - pairs["pets-cadm"] > 5 * 1000**2 * 18 * 4
 
 
 def masses(num_episodes, steps=30, seed=0):

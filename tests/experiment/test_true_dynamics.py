@@ -8,9 +8,7 @@ import pytest
 import headway
 from headway.envs.built_in import ClassicVectorEnv, RobotVectorEnv
 from headway.errors import ConfigError
-from headway.experiment import training
 from headway.experiment.methods import make_config
-from headway.experiment.rollouts import Arena
 from headway.experiment.true_dynamics import (
     ClassicDynamics,
     RobotSimulator,
@@ -19,6 +17,7 @@ from headway.experiment.true_dynamics import (
 from headway.planning.controller import env_action
 from headway.planning.returns import RolloutSettings, candidate_returns
 from headway.task import env_names, env_spec
+from headway.training.collect import Environments
 
 CLASSIC = ["pendulum", "cartpole-swingup"]
 ROBOTS = ["hopper", "slim-humanoid", "half-cheetah", "crippled-ant"]
@@ -32,44 +31,44 @@ def every_physics(env):
 
 
 def begin(env, physics, *, steps=7):
-    """An arena with one environment per physics, some random steps into an episode."""
+    """Environments, one per physics, some random steps into an episode."""
     settings = {"collection.num_episodes": len(physics), **SMALL}
     config = make_config(env, method="true-dynamics", preset="smoke", settings=settings)
-    arena = Arena.make(config)
+    environments = Environments.make(config)
     columns = {name: np.array([values[name] for values in physics]) for name in physics[0]}
-    arena.vector.reset(seed=[*range(len(physics))], options={"sim_params": columns})
+    environments.vector.reset(seed=[*range(len(physics))], options={"sim_params": columns})
     rng = np.random.default_rng(3)
     for _ in range(steps):
-        arena.vector.step(random_actions(arena, rng))
-    return config, arena
+        environments.vector.step(random_actions(environments, rng))
+    return config, environments
 
 
-def random_actions(arena, rng):
-    shape = (arena.vector.num_envs, arena.task.action_size)
-    return env_action(arena.task, rng.uniform(-1, 1, shape).astype(np.float32))
+def random_actions(environments, rng):
+    shape = (environments.vector.num_envs, environments.task.action_size)
+    return env_action(environments.task, rng.uniform(-1, 1, shape).astype(np.float32))
 
 
-def play(arena, sequence):
+def play(environments, sequence):
     """What the environments themselves pay for [env, horizon, action], in [-1, 1]."""
-    total = np.zeros(arena.vector.num_envs)
+    total = np.zeros(environments.vector.num_envs)
     for step in range(sequence.shape[1]):
-        actions = env_action(arena.task, sequence[:, step])
-        total += arena.vector.step(actions)[1]
+        actions = env_action(environments.task, sequence[:, step])
+        total += environments.vector.step(actions)[1]
     return total
 
 
 @pytest.mark.parametrize("env", CLASSIC)
 def test_compiled_equations_step_as_the_environment_under_every_physics(env):
     physics = every_physics(env)
-    _, arena = begin(env, physics)
-    vector = arena.vector
+    _, environments = begin(env, physics)
+    vector = environments.vector
     assert isinstance(vector, ClassicVectorEnv)
     rng = np.random.default_rng(0)
     sim_params = {k: jnp.asarray(v, jnp.float32) for k, v in vector.sim_params.items()}
     step = jax.jit(lambda s, a: vector.world.next_state(s, a, sim_params, jnp))
     for _ in range(12):
         before = vector.states
-        actions = random_actions(arena, rng)
+        actions = random_actions(environments, rng)
         obs = vector.step(actions)[0]
         found = step(jnp.asarray(before, jnp.float32), jnp.asarray(actions))
         # Numbers of up to a few hundred in single precision, amplified by light masses.
@@ -79,8 +78,8 @@ def test_compiled_equations_step_as_the_environment_under_every_physics(env):
 
 @pytest.mark.parametrize("env", CLASSIC)
 def test_imagined_returns_of_the_equations_are_what_the_environment_pays(env):
-    config, arena = begin(env, every_physics(env))
-    vector, task = arena.vector, arena.task
+    config, environments = begin(env, every_physics(env))
+    vector, task = environments.vector, environments.task
     assert isinstance(vector, ClassicVectorEnv)
     sequences = np.random.default_rng(1).uniform(-1, 1, (vector.num_envs, 3, 9, 1))
     candidates = jnp.asarray(sequences, jnp.float32)
@@ -94,33 +93,33 @@ def test_imagined_returns_of_the_equations_are_what_the_environment_pays(env):
         settings=RolloutSettings.of(config.planner, 1),
         key=jax.random.key(0),
     )
-    paid = play(arena, np.asarray(candidates[:, 1]))
+    paid = play(environments, np.asarray(candidates[:, 1]))
     np.testing.assert_allclose(found[:, 1], paid, rtol=1e-4)
     assert np.abs(found[:, 0] - paid).min() > 1e-4
 
 
 @pytest.mark.parametrize("env", ROBOTS)
 def test_imagined_returns_of_robots_are_what_the_environment_pays_to_the_bit(env):
-    config, arena = begin(env, every_physics(env))
-    simulator = make_simulator(arena, config.planner)
+    config, environments = begin(env, every_physics(env))
+    simulator = make_simulator(environments, config.planner)
     assert isinstance(simulator, RobotSimulator)
-    shape = (arena.vector.num_envs, 3, 6, arena.task.action_size)
+    shape = (environments.vector.num_envs, 3, 6, environments.task.action_size)
     candidates = np.random.default_rng(1).uniform(-1, 1, shape).astype(np.float32)
     found = np.asarray(simulator.returns(candidates))
     again = np.asarray(simulator.returns(candidates))
-    paid = play(arena, candidates[:, 1])
+    paid = play(environments, candidates[:, 1])
     np.testing.assert_array_equal(found, again)
     np.testing.assert_allclose(found[:, 1], paid, rtol=1e-6)
     assert np.abs(found[:, 0] - paid).min() > 1e-4
 
 
 def test_a_robot_that_mujoco_gives_up_on_ranks_last():
-    config, arena = begin("half-cheetah", every_physics("half-cheetah")[:1])
-    vector = arena.vector
+    config, environments = begin("half-cheetah", every_physics("half-cheetah")[:1])
+    vector = environments.vector
     assert isinstance(vector, RobotVectorEnv)
     vector.datas[0].qpos[4] = 1e12  # beyond what MuJoCo accepts
-    simulator = make_simulator(arena, config.planner)
-    candidates = np.zeros((1, 2, 4, arena.task.action_size), np.float32)
+    simulator = make_simulator(environments, config.planner)
+    candidates = np.zeros((1, 2, 4, environments.task.action_size), np.float32)
     assert not np.isfinite(simulator.returns(candidates)).any()
 
 
@@ -142,28 +141,6 @@ def test_a_run_on_the_simulator_can_be_tested_again(tmp_path):
     again = headway.evaluate(tmp_path, groups=["train"], num_episodes=1)
     assert len(again) == 1
     assert (again.cost.evaluations_per_step, again.cost.flop_per_step) == (2 * 6, 0)
-
-
-def test_an_interrupted_test_on_the_simulator_goes_on_to_the_same_end(tmp_path, monkeypatch):
-    settings = SMALL | SHORT
-    config = make_config("hopper", method="true-dynamics", preset="smoke", settings=settings)
-    training.train_run(config, tmp_path / "whole")
-    act, calls = training.AgentPolicy.__call__, []
-
-    def interrupted(self, obs):
-        calls.append(obs)
-        if len(calls) == 9:  # in the second batch
-            raise KeyboardInterrupt
-        return act(self, obs)
-
-    with monkeypatch.context() as patch:
-        patch.setattr("headway.storage.progress_store.EVERY", 0)
-        patch.setattr(training.AgentPolicy, "__call__", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            training.train_run(config, tmp_path / "cut")
-    training.train_run(config, tmp_path / "cut")
-    ends = [(tmp_path / name / "evaluation.csv").read_text() for name in ("whole", "cut")]
-    assert ends[0] == ends[1]
 
 
 def test_the_simulator_beats_random_actions(tmp_path):

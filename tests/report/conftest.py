@@ -1,14 +1,12 @@
 """A run directory written by hand: what a quick Pendulum run leaves behind, in shape."""
 
-import json
-
 import numpy as np
 import pytest
 
+import runs
 from headway import settings
 from headway.config import CollectionConfig, Config
-from headway.storage.run_dir import RunDir
-from headway.storage.tables import EpisodeRow
+from headway.training.run import EpisodeRow
 
 TRAIN = (0.5, 0.75, 1.0, 1.25)
 GROUPS = {"train": TRAIN, "low": (0.25, 0.375), "high": (1.5, 1.75)}
@@ -76,7 +74,6 @@ def write(
 ):
     """Write every file that the figures read; `lift` is added to the returns of the tests."""
     rng = np.random.default_rng(seed)
-    run = RunDir(path)
     config = Config(
         env=env,
         method=method,
@@ -85,10 +82,7 @@ def write(
         collection=CollectionConfig(num_iterations=iterations, num_episodes=5),
     )
     config = settings.override(config, settings_changed or {})
-    path.mkdir(parents=True, exist_ok=True)
-    content = {"schema": 1, "config": settings.to_dict(config)}
-    (path / "config.json").write_text(json.dumps(content))
-    run.append_metrics(metrics_rows(rng, iterations, evaluated))
+    metrics = list(metrics_rows(rng, iterations, evaluated))
     rows = [
         EpisodeRow(
             method, env, seed, i, group, physics(lengths[k % len(lengths)]), k, float(value), 200
@@ -97,9 +91,8 @@ def write(
         for group, lengths in GROUPS.items()
         for k, value in enumerate(rng.normal(LEVELS[group] + lift, 150, 8))
     ]
-    run.append_evaluation(rows)
-    run.append_assignments(assignment_rows(rng, iterations, members, heads))
-    run.append_prediction_errors(
+    assignments = list(assignment_rows(rng, iterations, members, heads))
+    errors = [
         {
             "iteration": i,
             "group": group,
@@ -109,8 +102,13 @@ def write(
         for i in evaluated
         for group, scale in (("train", 0.35), ("low", 0.9), ("high", 0.6))
         for step in range(1, 21)
-    )
-    return path
+    ]
+    tables = {
+        "evaluation.csv": [row.to_csv() for row in rows],
+        "assignments.csv": assignments,
+        "prediction_error.csv": errors,
+    }
+    return runs.write_run(path, config, metrics, tables)
 
 
 @pytest.fixture(scope="session")

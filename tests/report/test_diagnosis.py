@@ -10,14 +10,12 @@ from headway.cli import main
 from headway.errors import ConfigError, RunError, UnknownNameError
 from headway.experiment.methods import make_config
 from headway.report import diagnosis
-from headway.storage.run_dir import RunDir
-
-SAMPLE = Path(__file__).parent.parent / "data" / "run-schema-2"  # two of three iterations
+from headway.training.run import RunDir
 
 
 @pytest.fixture
-def run_dir(tmp_path):
-    return Path(shutil.copytree(SAMPLE, tmp_path / "run"))
+def run_dir(two_iterations, tmp_path):
+    return Path(shutil.copytree(two_iterations, tmp_path / "run"))
 
 
 def files(path):
@@ -75,7 +73,8 @@ def test_only_models_with_heads_are_diagnosed(tmp_path):
 
 @pytest.mark.parametrize("words", [[], ["--collected"]])
 def test_only_trained_runs_are_diagnosed(tmp_path, words, capsys):
-    RunDir(tmp_path / "run").create_or_resume(make_config("pendulum", preset="smoke"))
+    (tmp_path / "run").mkdir()
+    RunDir(tmp_path / "run").begin(make_config("pendulum", preset="smoke"))
     assert main(["diagnose", str(tmp_path / "run"), "--quiet", *words]) == 1
     assert "has no finished iteration yet" in capsys.readouterr().err
 
@@ -139,5 +138,5 @@ def test_damaged_tests_are_noticed(tested, tmp_path):
     content = bytearray(damaged.read_bytes())
     content[-1] ^= 1
     damaged.write_bytes(content)
-    with pytest.raises(RunError, match=r"tests/iteration-001\.safetensors is damaged"):
+    with pytest.raises(RunError, match=r"iteration-001\.safetensors is damaged"):
         headway.diagnose(path)

@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
+import runs
 from headway.errors import RunError
 from headway.experiment.methods import make_config
 from headway.report.dynamics import Changes, choose_views, collect_changes
@@ -14,8 +15,8 @@ from headway.report.figures import _tested, save_run_figures
 from headway.report.obs_names import obs_names
 from headway.report.physics import axis_label, distinct, full_label, varying
 from headway.report.tables import by_group, by_physics, envs, evaluation
-from headway.storage.tables import EpisodeRow
 from headway.task import env_spec
+from headway.training.run import EpisodeRow
 
 ALL = ["learning_curve.png", "evaluation.png", "head_shares.png", "prediction_error.png"]
 
@@ -53,6 +54,7 @@ def test_a_missing_file_leaves_its_figure_out(run_dir, missing, figure):
 
 def test_a_run_without_a_finished_iteration_has_no_figures(run_dir):
     (run_dir / "metrics.jsonl").write_text("")
+    runs.accept_changes(run_dir)
     assert save_run_figures(run_dir) == []
 
 
@@ -64,6 +66,7 @@ def test_a_run_of_one_iteration_with_many_members(tmp_path, write_run):
 def test_diverged_predictions_are_drawn_on_a_log_scale(run_dir):
     table = run_dir / "prediction_error.csv"
     table.write_text(table.read_text() + "4,low,21,1e6\n4,low,22,nan\n")
+    runs.accept_changes(run_dir)
     assert len(save_run_figures(run_dir)) == 4
 
 
@@ -77,6 +80,7 @@ def test_an_unseen_training_group_is_optional_in_the_metrics(run_dir):
     for row in rows:
         row.pop("evaluation")
     (run_dir / "metrics.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    runs.accept_changes(run_dir)
     assert save_run_figures(run_dir)[0].name == "learning_curve.png"
 
 

@@ -21,9 +21,9 @@ from headway.report.page.contexts import principal_components, variance_between
 from headway.report.page.runs import load_runs, train_command
 from headway.report.page.series import Comparison
 from headway.report.page.svg import THEME
-from headway.storage.run_dir import RunDir
+from headway.training.run import RunDir
+from runs import accept_changes
 
-SAMPLE = Path(__file__).parent.parent / "data" / "run-schema-2"  # two of three iterations
 HOSTILE = '<script>alert("1")</script>&amp;$x_{2}$'
 
 
@@ -191,6 +191,7 @@ def test_numbers_out_of_range_are_drawn_all_the_same(pair, tmp_path):
     )
     errors = pair / "tmcl-0/prediction_error.csv"
     errors.write_text(errors.read_text() + "4,low,21,inf\n4,high,21,nan\n4,far,1,nan\n")
+    accept_changes(pair / "tmcl-0")
     chosen = ["head-shares", "prediction-error"]
     page = write_report([pair], tmp_path / "report.html", only=chosen).read_text()
     assert page.count("<figure>") == 2 + 3  # runs, groups with a finite error
@@ -199,11 +200,13 @@ def test_numbers_out_of_range_are_drawn_all_the_same(pair, tmp_path):
 def test_unfinished_runs_have_curves_but_no_final_results(folder, tmp_path):
     lines = (folder / "tmcl-2/metrics.jsonl").read_text().splitlines(keepends=True)
     (folder / "tmcl-2/metrics.jsonl").write_text("".join(lines[:3]))
+    accept_changes(folder / "tmcl-2")
     page = write_report([folder], tmp_path / "report.html").read_text()
     assert "3 of 5 iterations are finished" in page
     assert {row["seed"] for row in numbers(page) if row["method"] == "tmcl"} == {"0", "1"}
     assert "tmcl on pendulum (2)" in page
     (folder / "tmcl-2/metrics.jsonl").write_text("")
+    accept_changes(folder / "tmcl-2")
     assert (
         "0 of 5 iterations are finished" in write_report([folder], tmp_path / "b.html").read_text()
     )
@@ -218,6 +221,7 @@ def test_names_with_html_are_only_text(tmp_path, write_run):
     for table in ("evaluation.csv", "prediction_error.csv"):
         text = (path / table).read_text().replace(",low,", ',"' + HOSTILE.replace('"', '""') + '",')
         (path / table).write_text(text)
+    accept_changes(path)
     page = write_report([path], tmp_path / "report.html").read_text()
     assert page.count("<script") == 1
     assert "<b>" not in page
@@ -226,24 +230,24 @@ def test_names_with_html_are_only_text(tmp_path, write_run):
     assert HOSTILE in map(html.unescape, bars)  # as it is, not as mathematics
 
 
-def test_contexts_are_drawn_from_the_checkpoint(tmp_path):
-    page = write_report([SAMPLE], tmp_path / "report.html", only=["contexts"]).read_text()
+def test_contexts_are_drawn_from_the_checkpoint(two_iterations, tmp_path):
+    page = write_report([two_iterations], tmp_path / "report.html", only=["contexts"]).read_text()
     assert "between physics: 0." in page
     assert "1st component" in page
-    path = Path(shutil.copytree(SAMPLE, tmp_path / "run"))
+    path = Path(shutil.copytree(two_iterations, tmp_path / "run"))
     shutil.rmtree(path / "data")
     page = write_report([path], tmp_path / "b.html", only=["contexts"]).read_text()
     assert f"{path} has no contexts to show: " in text_of(page)
 
 
-def test_colours_follow_the_theme(tmp_path):
+def test_colours_follow_the_theme(two_iterations, tmp_path):
     lights = [light for light, _ in THEME.values()]
     assert len(set(lights)) == len(lights)
-    page = write_report([SAMPLE], tmp_path / "report.html", only=["contexts"]).read_text()
+    page = write_report([two_iterations], tmp_path / "report.html", only=["contexts"]).read_text()
     figure = re.search(r"<figure>.*?</figure>", page, re.DOTALL)[0]
     assert "#" not in re.sub(r'(?:href="|url\()#', "", figure)  # no colour but the theme's
     used = set(re.findall(r"fill: var\(--(p\d+)\)", figure))
-    physics = {tuple(t.sim_params.items()) for t in RunDir(SAMPLE).load_data()}
+    physics = {tuple(t.sim_params.items()) for t in RunDir(two_iterations).load_data()}
     assert len(used) == len(physics) > 1
 
 
@@ -254,14 +258,17 @@ def test_a_method_without_a_model_has_every_chapter(tmp_path):
     assert "No learned context: random, seed 0." in page
 
 
-def test_episodes_shorter_than_the_history_have_no_contexts(tmp_path, monkeypatch):
+def test_episodes_shorter_than_the_history_have_no_contexts(two_iterations, tmp_path, monkeypatch):
     short = [
         dataclasses.replace(t, obs=t.obs[:11], action=t.action[:10], reward=t.reward[:10])
-        for t in RunDir(SAMPLE).load_data()
+        for t in RunDir(two_iterations).load_data()
     ]
     monkeypatch.setattr(RunDir, "load_data", lambda self: short)
-    page = write_report([SAMPLE], tmp_path / "report.html", only=["contexts"]).read_text()
-    assert f"{SAMPLE} has no contexts to show: none of its collected episodes is" in text_of(page)
+    page = write_report([two_iterations], tmp_path / "report.html", only=["contexts"]).read_text()
+    assert (
+        f"{two_iterations} has no contexts to show: none of its collected episodes is"
+        in text_of(page)
+    )
 
 
 def test_only_coordinates_are_shortened():

@@ -2,18 +2,17 @@
 
 import io
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from headway.report.page.build import write_report
+from runs import accept_changes
 
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "google-chrome"))), None
 )
-SAMPLE = Path(__file__).parent.parent / "data" / "run-schema-2"
 WIDTHS = {"desktop": (1280, 900), "phone": (360, 780)}
 PAPER = {"light": (255, 255, 255), "dark": (0x17, 0x18, 0x1C)}
 
@@ -32,7 +31,7 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory, write_run):
+def report(tmp_path_factory, write_run, two_iterations):
     """Ten methods, so that legend and tables are crowded; one run is half finished.
 
     Two have three seeds, and so intervals; one run was really trained, and has contexts to show.
@@ -45,9 +44,10 @@ def report(tmp_path_factory, write_run):
         for seed in (1, 2) if index in (0, 2) else ():
             place = root / f"runs/{method}-{seed}"
             write_run(place, method=method, heads=heads, evaluated=(1, 4), seed=seed)
-    shutil.copytree(SAMPLE, root / "runs/trained")
+    shutil.copytree(two_iterations, root / "runs/trained")
     metrics = root / "runs/method-number-1/metrics.jsonl"
     metrics.write_text("".join(metrics.read_text().splitlines(keepends=True)[:2]))
+    accept_changes(metrics.parent)
     return write_report([root / "runs"], root / "report.html")
 
 

@@ -9,12 +9,12 @@ from PIL import Image, ImageColor
 
 from headway import cli
 from headway.errors import BadEnvironmentError, ConfigError
-from headway.experiment.loading import load_task
 from headway.experiment.methods import make_config
 from headway.planning.acting import RandomAgent
 from headway.report import film, recording
 from headway.report.style import HEADS, INK
-from headway.storage.run_dir import RunDir
+from headway.training.loading import load_task
+from headway.training.run import RunDir
 
 SCENE = (240, 320)
 
@@ -87,7 +87,7 @@ def run_dir(tmp_path, monkeypatch):
     """A run whose agent acts at random."""
     monkeypatch.setattr(recording, "load_agent", lambda run, config: RandomAgent(load_task(config)))
     run = RunDir(tmp_path / "run")
-    run.create_or_resume(make_config("pendulum", preset="smoke"))
+    run.begin(make_config("pendulum", preset="smoke"))
     return run.path
 
 

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from headway.errors import ConfigError
-from headway.experiment.references import normalised
 from headway.report.statistics import (
     Improvement,
     caution,
@@ -22,6 +21,7 @@ from headway.report.statistics import (
     standard_deviation,
     verdict,
 )
+from headway.training.references import normalised
 
 # Five and four runs of four tasks, as rliable takes them: [run, task].
 A = np.array(

@@ -1,17 +1,14 @@
 """Runs that are written instead of trained, and a board that remembers what it was told."""
 
-import json
-
 import numpy as np
 
-from headway import settings
+import runs
 from headway.errors import BusyError, DivergenceError
 from headway.experiment.methods import make_config
-from headway.storage.run_dir import RunDir
-from headway.storage.tables import EpisodeRow
 from headway.sweeps.board import Board
 from headway.sweeps.jobs import Job
 from headway.task import sim_param_sets
+from headway.training.run import EpisodeRow
 
 TINY = {
     "collection.episode_length": 6,
@@ -67,14 +64,10 @@ def level(config, iteration):
     return 10.0 * len(config.method) + config.seed + iteration
 
 
-def write_run(config, path, progress=None):
-    """Write the files that reports read, as a run of the first schema."""
-    path.mkdir(parents=True, exist_ok=True)
-    content = {"schema": 1, "config": settings.to_dict(config)}
-    (path / "config.json").write_text(json.dumps(content))
-    run = RunDir(path)
+def write_run(config, path, progress=None, keep=None):
+    """Write the files that reports read; with the tests of all iterations, or of one."""
     sets = sim_param_sets(config)
-    rows = []
+    lines, rows = [], []
     for i in range(config.collection.num_iterations):
         returns = [level(config, i) - 1, level(config, i) + 1]
         metrics = {
@@ -87,7 +80,7 @@ def write_run(config, path, progress=None):
             "evaluation": {},
             "seconds": {"collect": 1.0, "fit": 2.0, "evaluate": 1.0},
         }  # fmt: skip
-        run.append_metrics([metrics])
+        lines.append(metrics)
         for group in sets.group_names:
             shift = 100.0 if group == "train" else 0.0
             rows += [
@@ -99,7 +92,8 @@ def write_run(config, path, progress=None):
             ]  # fmt: skip
         if progress:
             progress.iteration_done(metrics)
-    run.append_evaluation(rows)
+    kept = [row.to_csv() for row in rows if keep is None or row.iteration == keep]
+    runs.write_run(path, config, lines, {"evaluation.csv": kept})
 
 
 BUSY = BusyError("held by another process")

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from headway.experiment.training import train_run
-from headway.storage.run_dir import RunDir
-from headway.storage.run_lock import LOCK
+from headway.training.run import LOCK, RunDir
+from headway.training.train import train_run
 
 
 def holder(path: Path) -> int:

@@ -15,7 +15,6 @@ from headway.report.comparison.figure import _curves, _dots, arm_styles, has_cur
 from headway.report.comparison.runs import Found, Point, _points, find
 from headway.report.comparison.verdicts import verdicts
 from headway.report.comparison.writing import spread, table_rows, write_table
-from headway.storage.run_dir import RunDir
 from headway.sweeps import running
 from headway.sweeps.experiments import Arm, Experiment, experiment, sweep_experiment
 from headway.sweeps.jobs import Cell, Comparison
@@ -89,10 +88,7 @@ def test_one_test_per_run_is_drawn_as_dots(training, tmp_path):
 
 def test_arms_of_different_length_that_are_tested_once_are_dots(training, tmp_path, monkeypatch):
     def last_only(config, path, progress):
-        fakes.write_run(config, path)
-        kept = [row for row in RunDir(path).evaluation() if row.iteration == tested[config.method]]
-        (path / "evaluation.csv").unlink()
-        RunDir(path).append_evaluation(kept)
+        fakes.write_run(config, path, keep=tested[config.method])
 
     tested = {"mcl": 0, "tmcl": 1}
     monkeypatch.setattr(running, "train_run", last_only)

@@ -7,8 +7,8 @@ import fakes
 import pytest
 
 from headway.cli import main
-from headway.storage.run_dir import RunDir
 from headway.sweeps.experiments import EXPERIMENTS
+from headway.training.run import RunDir
 
 WORDS = ("--envs", "pendulum", "--preset", "smoke", "--one-by-one", "--quiet")
 

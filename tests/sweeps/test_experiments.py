@@ -8,10 +8,10 @@ import pytest
 
 from headway.errors import ConfigError, RunError, UnknownNameError
 from headway.experiment.methods import METHODS, PRESETS, make_config
-from headway.experiment.training import train_run
 from headway.settings import override
 from headway.sweeps.experiments import EXPERIMENTS, experiment, sweep_experiment
 from headway.sweeps.jobs import Cell, Comparison, Job, fingerprint
+from headway.training.train import train_run
 
 ENVS = ("cartpole-swingup", "pendulum", "hopper", "slim-humanoid", "half-cheetah", "crippled-ant")
 

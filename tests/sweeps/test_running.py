@@ -3,21 +3,19 @@
 import io
 import itertools
 import shutil
-from pathlib import Path
 
 import fakes
 import pytest
 from rich.console import Console
 
 from headway.errors import ConfigError, RunError
-from headway.storage.run_dir import RunDir
-from headway.storage.run_lock import LOCK, locked
 from headway.sweeps import running
 from headway.sweeps.board import PlainBoard, describe
 from headway.sweeps.jobs import Job
 from headway.sweeps.live_board import LiveBoard
 from headway.sweeps.running import Workers, run_jobs
 from headway.sweeps.status import Status, StatusProgress
+from headway.training.run import LOCK, RunDir
 
 HERE = Workers(one_by_one=True)
 
@@ -64,10 +62,9 @@ def test_a_damaged_directory_is_told_and_left_alone(training, tmp_path):
     assert [seed for _, seed in training.calls] == [1]
 
 
-def test_a_run_with_a_damaged_table_does_not_count_as_finished(tmp_path):
-    whole = Path(__file__).parents[1] / "data" / "run-schema-2"
-    job = Job.of(RunDir(whole).config(), tmp_path)
-    shutil.copytree(whole, job.path)
+def test_a_run_with_a_damaged_table_does_not_count_as_finished(two_iterations, tmp_path):
+    job = Job.of(RunDir(two_iterations).config(), tmp_path)
+    shutil.copytree(two_iterations, job.path)
     assert job.finished_iterations == 2
     (job.path / "metrics.jsonl").write_text("{}\n")
     with pytest.raises(RunError, match=r"metrics.jsonl is damaged"):
@@ -105,7 +102,7 @@ def test_a_held_directory_is_busy_and_that_is_said_once(tmp_path, monkeypatch):
             fakes.write_run(job.config, job.path)
 
     monkeypatch.setattr(running.time, "sleep", sleep)
-    with locked(job.path):
+    with RunDir(job.path).locked():
         run_jobs([job], HERE, PlainBoard(stream))
     _, busy, done = stream.getvalue().splitlines()
     assert "busy  0/2" in busy

@@ -20,7 +20,6 @@ from headway.envs.built_in import ClassicVectorEnv, RobotVectorEnv
 from headway.envs.classic import ClassicWorld
 from headway.envs.futures import RobotFutures
 from headway.errors import ConfigError
-from headway.experiment.rollouts import Arena
 from headway.planning.acting import Decision, Physics
 from headway.planning.controller import env_action
 from headway.planning.devices import brought_to_each, whole_on_each
@@ -28,6 +27,7 @@ from headway.planning.imagination import over_rows
 from headway.planning.optimizers import Plan, SearchState, make_optimizer
 from headway.planning.step import scoring
 from headway.task import Task
+from headway.training.collect import Environments
 
 
 @runtime_checkable
@@ -89,18 +89,18 @@ class SimulatorAgent:
         return SimulatorState(action, shifted, key), decision
 
 
-def make_simulator(arena: Arena, planner: PlannerConfig) -> Simulator:
-    """The simulator behind the environments of an arena.
+def make_simulator(environments: Environments, planner: PlannerConfig) -> Simulator:
+    """The simulator behind some environments.
 
     Raises:
         ConfigError: It is none of the built-in ones.
     """
-    if isinstance(arena.vector, ClassicVectorEnv):
-        return ClassicSimulator(arena.vector, arena.task, planner)
-    if isinstance(arena.vector, RobotVectorEnv):
-        return RobotSimulator(arena.vector, arena.task, planner)
+    if isinstance(environments.vector, ClassicVectorEnv):
+        return ClassicSimulator(environments.vector, environments.task, planner)
+    if isinstance(environments.vector, RobotVectorEnv):
+        return RobotSimulator(environments.vector, environments.task, planner)
     raise ConfigError(
-        f"{arena.spec.name} has no simulator to plan with, allowed: the built-in environments;"
+        f"{environments.name} has no simulator to plan with, allowed: the built-in environments;"
         " choose another method than true-dynamics."
     )
 

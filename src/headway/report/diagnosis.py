@@ -11,22 +11,22 @@ from rich.table import Table
 from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import ConfigError
-from headway.experiment.loading import finished_iterations, load_agent
 from headway.experiment.methods import config_to_control
-from headway.experiment.selection import (
+from headway.planning.agent import Agent
+from headway.report.physics import distinct, full_label, varying
+from headway.report.tables import new_table
+from headway.task import sim_param_sets
+from headway.training.evaluate import known_groups, run_tests
+from headway.training.loading import load_agent
+from headway.training.progress import Progress
+from headway.training.run import RunDir
+from headway.training.selection import (
     LEVELS,
     EpisodeSelection,
     SelectionSummary,
     examine,
     summarise,
 )
-from headway.experiment.testing import known_groups, run_tests
-from headway.planning.agent import Agent
-from headway.report.physics import distinct, full_label, varying
-from headway.report.tables import new_table
-from headway.storage.run_dir import RunDir
-from headway.task import sim_param_sets
-from headway.training.progress import Progress
 
 Facts = dict[str, Any]
 
@@ -96,7 +96,6 @@ def diagnose(
         ConfigError: A setting is unknown, of the wrong type or out of range, or one that training
             has fixed; `collected` leaves no choice of groups and episodes; or the run's method
             has no model with heads.
-        LimitError: Planning needs more memory than is free.
     """
     run = RunDir(run_dir)
     _check_heads(run)
@@ -111,7 +110,7 @@ def diagnose(
     tested = run_tests(
         run_dir, groups=groups, num_episodes=num_episodes, settings=settings, progress=progress
     )
-    return examined(run, tested.config, tested.trajectories)
+    return examined(run, tested.config, tested.tests.trajectories)
 
 
 def _check_heads(run: RunDir) -> None:
@@ -130,7 +129,7 @@ def _collected(
             "groups or episodes are chosen together with `collected`, allowed: one of them; the"
             " collected episodes are all of training physics."
         )
-    return {COLLECTED: run.iteration_data(finished_iterations(run) - 1)}
+    return {COLLECTED: run.iteration_data(run.last_iteration)}
 
 
 def examined(

@@ -11,7 +11,6 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from headway.config import Config
-from headway.experiment.references import score_of
 from headway.report.physics import axis_label, distinct, value_label, varying
 from headway.report.style import (
     FAINT,
@@ -24,8 +23,8 @@ from headway.report.style import (
     label_axis,
     legend,
 )
-from headway.storage.run_dir import RunDir
-from headway.storage.tables import EpisodeRow, parse_sim_params
+from headway.training.references import score_of
+from headway.training.run import EpisodeRow, RunDir, parse_sim_params
 
 Row = dict[str, Any]
 

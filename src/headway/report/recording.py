@@ -12,15 +12,14 @@ from headway.config import Config
 from headway.envs import make
 from headway.envs.vector import Schedule
 from headway.errors import BadEnvironmentError, ConfigError
-from headway.experiment.loading import load_agent
 from headway.experiment.methods import config_to_evaluate
 from headway.planning.controller import Controller
 from headway.report import film
 from headway.report.film import Moment
-from headway.storage import files
-from headway.storage.run_dir import RunDir
 from headway.task import env_options, episode_length
+from headway.training.loading import load_agent
 from headway.training.progress import Progress
+from headway.training.run import RunDir, write_bytes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +85,7 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
         for moment in _episode(env, controller, options, seed, length):
             moments.append(moment)
             shown.advance()
-    files.write_bytes(path, film.draw(moments, env.metadata.get("render_fps", 20), path.suffix))
+    write_bytes(path, film.draw(moments, env.metadata.get("render_fps", 20), path.suffix))
     total = float(sum(moment.reward for moment in moments))
     return Recording(path, config.env, dict(moments[-1].sim_params), len(moments), total)
 

@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from headway.storage import files
+from headway.training.run import write_bytes
 
 INK = "#222222"
 FAINT = "#7a7a7a"
@@ -113,11 +113,11 @@ def figure(
         yield drawing
         image = io.BytesIO()
         drawing.savefig(image, format="png", dpi=DPI)
-        files.write_bytes(path, image.getvalue())
+        write_bytes(path, image.getvalue())
         if svg:
             drawn = io.BytesIO()
             drawing.savefig(drawn, format="svg", metadata={"Date": None})
-            files.write_bytes(path.with_suffix(".svg"), drawn.getvalue())
+            write_bytes(path.with_suffix(".svg"), drawn.getvalue())
 
 
 def legend(drawing: Figure, handles: Sequence[Any] | None = None) -> None:

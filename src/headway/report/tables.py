@@ -10,11 +10,11 @@ from rich.text import Text
 
 from headway.config import Config
 from headway.experiment.methods import METHODS, PRESETS
-from headway.experiment.references import mean_score, score_of
 from headway.report.physics import axis_label, distinct, full_label, value_label, varying
 from headway.settings import flatten, to_dict
-from headway.storage.tables import EpisodeRow
 from headway.task import EnvSpec, env_names, env_spec
+from headway.training.references import mean_score, score_of
+from headway.training.run import EpisodeRow
 
 Facts = dict[str, Any]
 

@@ -4,17 +4,18 @@ import dataclasses
 import time
 from collections.abc import Sequence
 
+import equinox as eqx
+import jax
 import numpy as np
 
 from headway.config import Config
-from headway.experiment.limits import num_parameters
-from headway.experiment.loading import load_task
 from headway.planning.flop import plan_flop
-from headway.storage.run_dir import RunDir
 from headway.sweeps.board import first_status
 from headway.sweeps.jobs import Job
 from headway.sweeps.status import State
 from headway.task import episode_length, sim_param_sets
+from headway.training.loading import initial, load_task
+from headway.training.run import RunDir
 
 PER_PRODUCT = 3.0  # a run takes about so much longer than its matrix products alone
 _SIZE, _PRODUCTS = 768, 12  # matrices that are multiplied to time this machine
@@ -88,7 +89,7 @@ def run_flop(config: Config, first_iteration: int = 0) -> float:
     task, length = load_task(config), episode_length(config)
     per_step = plan_flop(config.model, config.planner, task)
     # Forwards, and backwards twice as much.
-    per_sample = 6.0 * num_parameters(config, task) if config.model.learns else 0.0
+    per_sample = 6.0 * _num_parameters(config) if config.model.learns else 0.0
     num_unseen = len(sim_param_sets(config).group_names) - 1
     total = 0.0
     for iteration in range(first_iteration, config.collection.num_iterations):
@@ -103,6 +104,11 @@ def run_flop(config: Config, first_iteration: int = 0) -> float:
         passes = config.fitting.epochs
         total += steps * per_step + passes * samples * per_sample
     return total
+
+
+def _num_parameters(config: Config) -> int:
+    learned = eqx.filter_eval_shape(lambda: initial(config, load_task(config)))
+    return sum(leaf.size for leaf in jax.tree.leaves(learned.fit.model))
 
 
 def _planned(job: Job) -> PlannedJob:

@@ -15,10 +15,10 @@ from headway import settings
 from headway.config import Config
 from headway.errors import ConfigError, RunError
 from headway.experiment.methods import make_config
-from headway.storage.run_dir import RunDir
 from headway.sweeps import results_folder
 from headway.sweeps.experiments import Arm, Experiment, Settings
 from headway.task import env_spec
+from headway.training.run import RunDir
 
 
 class Cell(NamedTuple):

@@ -22,11 +22,11 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from headway import settings
 from headway.errors import ConfigError
-from headway.storage.interrupts import stop_requests
 from headway.sweeps.board import Board, first_status
 from headway.sweeps.jobs import Job
 from headway.sweeps.running import PATIENCE, Workers, make_run
 from headway.sweeps.status import Status, reason
+from headway.training.stopping import stop_requests
 
 MAX_LOSSES = 5  # of one run's workers, without an iteration finished between them
 POLL = 0.5  # seconds

@@ -10,8 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from headway.errors import RunError
-from headway.storage import files
+from headway.training.run import write_json
 
 NOTE = "comparison.json"
 GROWING = ("envs", "seeds", "arms")  # what the same comparison may have more of
@@ -36,18 +35,18 @@ def choose(usual: Path, facts: Facts) -> Path:
 
 def claim(folder: Path, facts: Facts) -> None:
     """Note what a folder holds."""
-    files.write_json(folder / NOTE, _plain(facts))
+    write_json(folder / NOTE, _plain(facts))
 
 
 def _may_replace(folder: Path, facts: Facts) -> bool:
     """Whether all that a folder holds is among what is compared now."""
     try:
-        before = files.read_json(folder / NOTE)
+        before = json.loads((folder / NOTE).read_bytes())
         now = _plain(facts)
         fixed = now.keys() - set(GROWING)
         same = all(before[name] == now[name] for name in fixed)
         return same and all(one in now[name] for name in GROWING for one in before[name])
-    except (RunError, KeyError, TypeError):  # whatever it is, it is not ours
+    except (OSError, ValueError, KeyError, TypeError):  # whatever it is, it is not ours
         return False
 
 

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 
 from headway.errors import BusyError, ConfigError
-from headway.experiment.training import train_run
 from headway.models.compilation import prepare_jax
 from headway.sweeps.board import Board, first_status
 from headway.sweeps.jobs import Job
 from headway.sweeps.status import Status, StatusProgress, Tell, reason
+from headway.training.train import train_run
 
 PATIENCE = 5.0  # seconds before a run is tried again that another process holds
 INSTALL_RAY = "`pip install '.[ray]'` in the clone of Headway"

@@ -9,9 +9,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from headway.data import Trajectory
-from headway.experiment.diagnostics import imagined_error
 from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
-from headway.experiment.rollouts import Arena
 from headway.models.adapted import MetaSetup, ReluNet, meta_epoch
 from headway.models.dynamics import Statistics
 from headway.models.fitting import FitData
@@ -19,6 +17,8 @@ from headway.models.recurrent import RecurrentNet, RecurrentSetup, recurrent_epo
 from headway.models.updates import EpochStats, Fitted
 from headway.planning.meta.agent import AdaptiveAgent, imagine
 from headway.planning.meta.models import AdaptiveModel, GradientAdapted, Recurrent
+from headway.training.collect import Environments
+from headway.training.diagnostics import imagined_error
 
 
 class Adaptive(Learner):
@@ -64,11 +64,11 @@ class Adaptive(Learner):
     def agent(
         self,
         learned: Learned,
-        arena: Arena | None = None,
+        environments: Environments | None = None,
         trajectories: Sequence[Trajectory] = (),
     ) -> AdaptiveAgent:
         """See `Learner.agent`."""
-        del arena, trajectories
+        del environments, trajectories
         return AdaptiveAgent(self.acting_model(learned), self.task, self.config.planner)
 
     def prediction_error(

@@ -10,13 +10,13 @@ from jaxtyping import Float, PRNGKeyArray
 from headway.config import Config
 from headway.data import Episodes, Samples, Trajectory
 from headway.experiment.methods import told_sim_params
-from headway.experiment.rollouts import Arena
 from headway.models.dynamics import Statistics
 from headway.models.fitting import FitData, make_data
 from headway.models.updates import EpochStats
 from headway.planning.acting import Acting
 from headway.settings import override
 from headway.task import Task
+from headway.training.collect import Environments
 
 
 class Learned(NamedTuple):
@@ -69,14 +69,14 @@ class Learner(abc.ABC):
     def agent(
         self,
         learned: Learned,
-        arena: Arena | None = None,
+        environments: Environments | None = None,
         trajectories: Sequence[Trajectory] = (),
     ) -> Acting:
         """The agent that acts with what was learned.
 
         Args:
             learned: What was learned.
-            arena: Where it acts, if that is known; only the simulator asks.
+            environments: Where it acts, if that is known; only the simulator asks.
             trajectories: What it was learned from; only heads that keep learning ask.
         """
 

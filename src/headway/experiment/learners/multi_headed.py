@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from headway.data import Episodes, Trajectory
-from headway.experiment.diagnostics import head_shares, prediction_error
 from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
 from headway.experiment.methods import told_sim_params
-from headway.experiment.rollouts import Arena
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitSetup, FitState, episode_losses, fit_epoch
 from headway.planning.agent import Agent
 from headway.planning.last_layer.prior import fit_prior
+from headway.training.collect import Environments
+from headway.training.diagnostics import head_shares, prediction_error
 
 
 class MultiHeaded(Learner):
@@ -58,11 +58,11 @@ class MultiHeaded(Learner):
     def agent(
         self,
         learned: Learned,
-        arena: Arena | None = None,
+        environments: Environments | None = None,
         trajectories: Sequence[Trajectory] = (),
     ) -> Agent:
         """See `Learner.agent`."""
-        del arena
+        del environments
         model, statistics = learned.fit.model, learned.statistics
         planner, history_length = self.config.planner, self.config.model.history_length
         prior = None

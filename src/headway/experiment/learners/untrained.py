@@ -7,8 +7,8 @@ from jaxtyping import PRNGKeyArray
 from headway.data import Trajectory
 from headway.errors import ConfigError
 from headway.experiment.learners.base import Fit, Learned, Learner
-from headway.experiment.rollouts import Arena
 from headway.planning.acting import Acting, RandomAgent
+from headway.training.collect import Environments
 
 
 class Untrained(Learner):
@@ -36,11 +36,11 @@ class Random(Untrained):
     def agent(
         self,
         learned: Learned,
-        arena: Arena | None = None,
+        environments: Environments | None = None,
         trajectories: Sequence[Trajectory] = (),
     ) -> Acting:
         """See `Learner.agent`."""
-        del learned, arena, trajectories
+        del learned, environments, trajectories
         return RandomAgent(self.task)
 
 
@@ -50,20 +50,22 @@ class Simulator(Untrained):
     def agent(
         self,
         learned: Learned,
-        arena: Arena | None = None,
+        environments: Environments | None = None,
         trajectories: Sequence[Trajectory] = (),
     ) -> Acting:
         """See `Learner.agent`.
 
         Raises:
-            ConfigError: No arena is given, or its simulator cannot be planned with.
+            ConfigError: No environments are given, or their simulator cannot be planned with.
         """
         del learned, trajectories
-        if arena is None:
+        if environments is None:
             raise ConfigError(
                 "a run on the true dynamics has no controller of its own, allowed: testing it in"
                 " its simulator; use `headway evaluate`."
             )
         from headway.experiment.true_dynamics import SimulatorAgent, make_simulator
 
-        return SimulatorAgent(make_simulator(arena, self.config.planner), self.config.planner)
+        return SimulatorAgent(
+            make_simulator(environments, self.config.planner), self.config.planner
+        )

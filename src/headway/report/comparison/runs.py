@@ -7,11 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from headway.storage.run_dir import RunDir
-from headway.storage.tables import format_sim_params
 from headway.sweeps.board import first_status
 from headway.sweeps.jobs import Cell, Comparison, Job
 from headway.task import env_options, episode_length, sim_param_sets
+from headway.training.run import RunDir, format_sim_params
 
 COLLECTED = "collected"
 

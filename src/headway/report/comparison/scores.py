@@ -4,7 +4,7 @@ import numpy as np
 
 from headway.report.comparison.runs import Found
 from headway.report.tables import Facts, by_group
-from headway.storage.run_dir import RunDir
+from headway.training.run import RunDir
 
 
 def last_tests(found: Found, env: str, arm: str) -> list[list[Facts]]:

@@ -9,7 +9,7 @@ from headway.report.comparison.runs import COLLECTED, Found
 from headway.report.comparison.scores import last_tests, unseen_scores
 from headway.report.comparison.verdicts import interquartile, verdicts
 from headway.report.statistics import MIN_RUNS
-from headway.storage import files, records
+from headway.training.run import csv_text, write_bytes
 
 RAW_COLUMNS = (
     "experiment", "arm", "env", "method", "preset", "seed", "iteration", "timesteps", "group",
@@ -21,7 +21,7 @@ IQM = "interquartile mean (95 %)"
 def write_raw(found: Found) -> Path:
     """Write every episode's return."""
     path = found.comparison.folder / f"{found.comparison.experiment.name}.csv"
-    records.write_csv(path, RAW_COLUMNS, found.rows)
+    write_bytes(path, csv_text(RAW_COLUMNS, found.rows).encode())
     return path
 
 
@@ -42,7 +42,7 @@ def write_table(found: Found, command: str) -> Path:
     if command:
         lines += ["The command, which resumes what was interrupted:", "", f"    {command}", ""]
     path = comparison.folder / f"{experiment.name}.md"
-    files.write_bytes(path, "\n".join(lines).encode())
+    write_bytes(path, "\n".join(lines).encode())
     return path
 
 

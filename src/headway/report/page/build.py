@@ -19,7 +19,7 @@ from headway.report.page.runs import load_runs
 from headway.report.page.series import Comparison
 from headway.report.page.svg import THEME
 from headway.report.page.symbols import same_symbol, symbol
-from headway.storage import files
+from headway.training.run import write_bytes
 
 SECTIONS: dict[str, Callable[[Comparison], Section]] = {
     "results": sections.results,
@@ -69,7 +69,7 @@ def write_report(
     words = ["headway", "report", *map(str, runs), "-o", str(out)]
     made = [_section(name, comparison, words) for name in names]
     page = render(comparison, made, shlex.join([*words, *(["--only", *only] if only else [])]))
-    files.write_bytes(Path(out), page.encode())
+    write_bytes(Path(out), page.encode())
     return Path(out)
 
 

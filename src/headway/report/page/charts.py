@@ -19,7 +19,7 @@ from headway.report.page.series import Series
 from headway.report.page.svg import DASHES, MARKERS, ORDERED, SWATCHES
 from headway.report.physics import axis_label, distinct, value_label, varying
 from headway.report.style import FAINT, INK, RULE, group_label, label_axis
-from headway.storage.tables import parse_sim_params
+from headway.training.run import parse_sim_params
 
 Marks = Mapping[str, float]
 TICK_LETTERS = 24  # in a line of a bar's name

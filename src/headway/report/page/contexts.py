@@ -8,11 +8,11 @@ from jaxtyping import Float
 
 from headway.data import Trajectory
 from headway.errors import RunError
-from headway.experiment.loading import load_agent
 from headway.planning.agent import Agent, encode
 from headway.planning.heads import RecentTransitions
 from headway.report.page.runs import LoadedRun
-from headway.storage.run_dir import RunDir
+from headway.training.loading import load_agent
+from headway.training.run import RunDir
 
 NUM_MOMENTS = 320  # of the collected episodes, evenly spread
 
@@ -37,7 +37,6 @@ def embed(run: LoadedRun) -> Embedding | None:
     Raises:
         RunError: The run has no checkpoint or no collected data, or they are damaged; or none of
             its episodes is longer than the history.
-        LimitError: The model needs more memory than is free.
     """
     if run.config.model.kind != "multi-headed":
         return None

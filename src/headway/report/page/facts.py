@@ -15,7 +15,7 @@ from headway.report.page.series import (
     used_settings,
     value_text,
 )
-from headway.storage.records import csv_lines
+from headway.training.run import csv_text
 
 PHASES = ("collect", "fit", "evaluate")
 _TEXTS = ("env", "method", "group", "sim_params")
@@ -147,7 +147,7 @@ def numbers(comparison: Comparison) -> Section:
         " episodes. Runs without a symbol are references."
     )
     blocks = [Block(table=Table([name.replace("_", " ") for name in shown], lines))]
-    csv = csv_lines(RAW_COLUMNS, rows, header=True)
+    csv = csv_text(RAW_COLUMNS, rows)
     if not rows:
         blocks, csv = [Block(texts=["No run is finished yet."])], ""
     return Section("numbers", "Raw numbers", lead, blocks, csv=csv)

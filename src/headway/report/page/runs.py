@@ -10,9 +10,7 @@ from headway import settings
 from headway.config import Config
 from headway.errors import HeadwayError, RunError
 from headway.experiment.methods import make_config
-from headway.storage import config_file
-from headway.storage.run_dir import RunDir
-from headway.storage.tables import EpisodeRow
+from headway.training.run import EpisodeRow, RunDir
 
 PHYSICS_FILE = "sim_params.json"
 
@@ -111,7 +109,7 @@ def _load_run(path: Path, notes: list[Note]) -> LoadedRun | None:
     config = attempt(run.config, None, "left out")
     if config is None:
         return None
-    facts = config_file.read(path / "config.json")
+    facts = run.metadata()
     metrics = attempt(run.metrics, [], "no learning curve, run time or final result")
     wanted = config.collection.num_iterations
     if len(metrics) < wanted:

@@ -8,10 +8,10 @@ import numpy as np
 
 from headway.config import Config
 from headway.config.unused import OPTIMIZER_SETTINGS
-from headway.experiment.references import mean_score, normalised, score_of
 from headway.report.page.runs import LoadedRun, Note
-from headway.storage.tables import EpisodeRow, format_sim_params
 from headway.task import env_names, env_options, episode_length
+from headway.training.references import mean_score, normalised, score_of
+from headway.training.run import EpisodeRow, format_sim_params
 
 RANDOM = "random"
 CEILING = "true-dynamics"

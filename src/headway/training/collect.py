@@ -1,0 +1,374 @@
+"""Acting in many environments at once and recording what happens.
+
+One vector environment and one compiled agent serve collection and evaluation alike.
+"""
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int, PRNGKeyArray
+
+from headway.config import Config
+from headway.data import Trajectory
+from headway.errors import BadEnvironmentError, HeadwayError
+from headway.planning.acting import Acting
+from headway.planning.controller import env_action
+from headway.sim_params import SimParamSets
+from headway.task import Task, env_options, env_spec, episode_length, sim_param_sets
+from headway.training.run import Arrays, trajectories_from, trajectory_arrays
+
+if TYPE_CHECKING:
+    from gymnasium.vector import VectorEnv
+
+
+@dataclasses.dataclass(frozen=True)
+class Episode:
+    """What defines an episode before it is run: physics and seed."""
+
+    sim_params: dict[str, float]
+    seed: int
+    schedule: Mapping[int, dict[str, float]] = dataclasses.field(default_factory=dict)
+    """Physics that change during the episode, by the step before which they do."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Environments:
+    """The vector environment that a run acts in, and its Task."""
+
+    name: str
+    """Short name of the environment."""
+    task: Task
+    vector: "VectorEnv"
+    sim_params: SimParamSets
+    episode_length: int
+
+    @classmethod
+    def make(cls, config: Config) -> "Environments":
+        """Make as many as a configuration collects episodes.
+
+        Raises:
+            BadEnvironmentError: The environment's spaces do not fit its Task.
+        """
+        from gymnasium.vector import AutoresetMode  # a controller is loaded without a simulator
+
+        from headway import envs
+
+        collection, options = config.collection, env_options(config)
+        task, sim_params = env_spec(config.env).make_task(**options), sim_param_sets(config)
+        vector = envs.make_vec(
+            config.env,
+            collection.num_episodes,
+            sim_params=sim_params,
+            options=options,
+            autoreset_mode=AutoresetMode.DISABLED,
+            episode_length=episode_length(config),
+            step_timeout_s=collection.step_timeout_s if collection.env_processes else None,
+        )
+        got = (vector.single_observation_space.shape, vector.single_action_space.shape)
+        allowed = ((task.obs_size,), (task.action_size,))
+        if got != allowed:
+            vector.close()
+            raise BadEnvironmentError(
+                f"{config.env} has observation and action shapes {got}, allowed: {allowed}, as"
+                f" its Task says; correct the environment or the Task."
+            )
+        return cls(config.env, task, vector, sim_params, episode_length(config))
+
+    def close(self) -> None:
+        """Free what the environments hold, and end their processes."""
+        self.vector.close()
+
+
+class Choice(NamedTuple):
+    """What a policy chose for every environment of a batch."""
+
+    action: Float[np.ndarray, "env action"]
+    """The actions to take, in [-1, 1]."""
+    failures: Int[np.ndarray, " env"]
+    """Planner iterations that found nothing finite."""
+    evaluations: Int[np.ndarray, " env"]
+    """Candidates that the planner scored."""
+
+
+Policy = Callable[[Float[np.ndarray, "env obs"]], Choice]
+"""Chooses scaled actions for a batch of environments, step by step."""
+
+
+def random_policy(environments: Environments, rng: np.random.Generator) -> Policy:
+    """Uniform random actions, as in the first iteration."""
+    num_envs = environments.vector.num_envs
+    shape, none = (num_envs, environments.task.action_size), np.zeros(num_envs, int)
+    return lambda obs: Choice(rng.uniform(-1.0, 1.0, shape).astype(np.float32), none, none)
+
+
+class AgentPolicy:
+    """An agent and what it remembers of each environment; it starts with an empty memory.
+
+    Args:
+        agent: The agent.
+        num_envs: Environments of the batch.
+        episodes: What they run, for an agent that is told the physics; surplus environments
+            repeat the last episode.
+        key: The planner's draws.
+    """
+
+    def __init__(
+        self, agent: Acting, num_envs: int, episodes: Sequence[Episode], *, key: PRNGKeyArray
+    ):
+        self._agent = agent
+        physics = [episode.sim_params for episode in fill(episodes, num_envs)]
+        self.state = agent.init(num_envs, key=key, sim_params=physics)
+
+    def __call__(self, obs: Float[np.ndarray, "env obs"]) -> Choice:
+        """Choose for every environment."""
+        self.state, decision = self._agent.act(self.state, jnp.asarray(obs, jnp.float32))
+        return Choice(*jax.device_get((decision.action, decision.failures, decision.evaluations)))
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannerUse:
+    """What planning took over some episodes; sums with `+`."""
+
+    steps: int = 0
+    """Environment steps that were planned."""
+    failures: int = 0
+    """Planner iterations that found nothing finite."""
+    evaluations: int = 0
+    """Candidates that were scored."""
+    timed_steps: int = 0
+    """Environment steps that were timed, those of surplus environments included."""
+    seconds: float = 0.0
+    """What the timed steps took."""
+
+    def __add__(self, other: "PlannerUse") -> "PlannerUse":
+        mine, others = dataclasses.astuple(self), dataclasses.astuple(other)
+        return PlannerUse(*(a + b for a, b in zip(mine, others, strict=True)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Rollout:
+    """Finished episodes, in the order they were asked for, without the invalid ones."""
+
+    trajectories: list[Trajectory]
+    use: PlannerUse
+    invalid: Mapping[int, str] = dataclasses.field(default_factory=dict)
+    """Why an episode is left out, by its number among those asked for."""
+    seconds: float = 0.0
+    """What all of it took."""
+
+    @property
+    def numbers(self) -> list[int]:
+        """The number of each trajectory's episode among those asked for."""
+        asked = range(len(self.trajectories) + len(self.invalid))
+        return [number for number in asked if number not in self.invalid]
+
+    def to_part(self) -> tuple[Arrays, dict[str, Any]]:
+        """Arrays and facts for `Partial.save`."""
+        arrays, facts = trajectory_arrays(self.trajectories)
+        use, invalid = dataclasses.asdict(self.use), list(map(list, self.invalid.items()))
+        return arrays, {**facts, "use": use, "invalid": invalid, "seconds": self.seconds}
+
+    @classmethod
+    def from_part(cls, arrays: Arrays, facts: Mapping[str, Any]) -> Self:
+        """Build what `to_part` took apart."""
+        use, invalid = PlannerUse(**facts["use"]), dict(facts["invalid"])
+        return cls(trajectories_from(arrays, facts), use, invalid, facts["seconds"])
+
+
+def run_episodes(
+    environments: Environments,
+    episodes: Sequence[Episode],
+    policy: Policy,
+    on_step: Callable[[int], None] = lambda steps: None,
+) -> Rollout:
+    """Run at most one episode in each environment of the batch, side by side.
+
+    Args:
+        environments: Surplus ones repeat the last episode and are dropped.
+        episodes: Physics and seeds, at most as many as there are environments.
+        policy: Chooses the actions.
+        on_step: Called after each step with the number of environments that stepped.
+
+    An episode that breaks (`HeadwayVectorEnv`), or with a number that is not finite, ends there
+    and is left out; the other environments go on.
+
+    Raises:
+        BadEnvironmentError: The environment raised, or returned something misshapen.
+    """
+    begun = time.perf_counter()
+    wanted, vector = len(episodes), environments.vector
+    filled = fill(episodes, vector.num_envs)
+    options: dict[str, Any] = {
+        "sim_params": {
+            name: np.array([episode.sim_params[name] for episode in filled])
+            for name in filled[0].sim_params
+        }
+    }
+    if any(episode.schedule for episode in filled):
+        options["schedule"] = [episode.schedule for episode in filled]
+    seeds: Any = [episode.seed for episode in filled]
+    valid = _ValidityFilter(environments.name, [episode.sim_params for episode in filled])
+    with valid.raising("reset"):
+        obs, info = vector.reset(seed=seeds, options=options)
+    valid.note(info, 0)
+    obs = valid.finite(obs, "obs", 0, np.zeros((len(filled), environments.task.obs_size)))
+    observations, actions, rewards = [obs], [], []
+    length = np.zeros(len(filled), np.int64)
+    terminated = np.zeros(len(filled), bool)
+    running = ~valid.broken
+    use = PlannerUse()
+    for step in range(1, environments.episode_length + 1):
+        started = time.perf_counter()
+        choice = policy(obs)
+        seconds = time.perf_counter() - started
+        planned = running[:wanted]
+        timed = step > 1  # the first one may compile
+        use += PlannerUse(
+            int(planned.sum()),
+            int(choice.failures[:wanted][planned].sum()),
+            int(choice.evaluations[:wanted][planned].sum()),
+            timed * len(filled),
+            timed * seconds,
+        )
+        with valid.raising(f"step {step}"):
+            obs, reward, ends, cut, info = vector.step(env_action(environments.task, choice.action))
+        valid.running = running
+        valid.note(info, step)
+        obs = valid.finite(obs, "obs", step, observations[-1])
+        observations.append(obs)
+        rewards.append(valid.finite(reward, "reward", step, np.zeros(len(filled))))
+        actions.append(choice.action)
+        length += running
+        terminated |= running & ends
+        running &= ~(ends | cut | valid.broken)
+        on_step(wanted)
+        if not running[:wanted].any():
+            break
+    table = np.stack(observations, 1), np.stack(actions, 1), np.stack(rewards, 1)
+    trajectories = [
+        Trajectory(
+            obs=table[0][row, : length[row] + 1].astype(np.float32),
+            action=table[1][row, : length[row]].astype(np.float32),
+            reward=table[2][row, : length[row]].astype(np.float64),
+            sim_params=episode.sim_params,
+            terminated=bool(terminated[row]),
+        )
+        for row, episode in enumerate(episodes)
+        if not valid.broken[row]
+    ]
+    invalid = {row: valid.reasons[row] for row in sorted(valid.reasons) if row < wanted}
+    return Rollout(trajectories, use, invalid, time.perf_counter() - begun)
+
+
+def fill(episodes: Sequence[Episode], num_envs: int) -> list[Episode]:
+    """Give every environment of a batch an episode; surplus ones repeat the last."""
+    return [*episodes, *[episodes[-1]] * (num_envs - len(episodes))]
+
+
+class _ValidityFilter:
+    """Looks at what the environments return, and notes the episodes that break.
+
+    Args:
+        name: The environment's.
+        physics: Simulator parameters of each environment of the batch.
+    """
+
+    def __init__(self, name: str, physics: Sequence[Mapping[str, float]]):
+        self._name, self._physics = name, physics
+        self.running = np.ones(len(physics), bool)
+        self.reasons: dict[int, str] = {}
+
+    @property
+    def broken(self) -> Bool[np.ndarray, " env"]:
+        """The environments whose episode broke."""
+        return np.isin(np.arange(len(self._physics)), list(self.reasons))
+
+    def note(self, info: Mapping[str, Any], step: int) -> None:
+        """Note the episodes of which the environments themselves say that they broke."""
+        for row, reason in info.get("broken", {}).items():
+            if self.running[row]:
+                where = f"{self._name} broke at step {step} under {self._physics[row]}"
+                self.reasons.setdefault(row, f"{where}: {' '.join(reason.split())[:300]}")
+
+    @contextlib.contextmanager
+    def raising(self, when: str) -> Iterator[None]:
+        """Turn whatever an environment raises into one line that says where.
+
+        Raises:
+            BadEnvironmentError: It raised.
+        """
+        try:
+            yield
+        except BadEnvironmentError as error:
+            raise BadEnvironmentError(f"{self._name} at {when}: {error}") from error
+        except HeadwayError:
+            raise
+        except Exception as error:
+            reason = " ".join(str(error).split())[:300]
+            raise BadEnvironmentError(
+                f"{self._name} raised {type(error).__name__} at {when}: {reason};"
+                " correct the environment, then the same command goes on."
+            ) from error
+
+    def finite(self, values: Any, what: str, step: int, instead: np.ndarray) -> np.ndarray:
+        """Replace what is not finite by `instead`, and note those episodes.
+
+        Raises:
+            BadEnvironmentError: The values have another shape, or are no numbers.
+        """
+        values = np.asarray(values)
+        if values.shape != instead.shape or values.dtype.kind not in "fiub":
+            raise BadEnvironmentError(
+                f"{self._name} returned {what} of shape {values.shape} and type {values.dtype} at"
+                f" step {step}, allowed: numbers of shape {instead.shape}; correct the environment."
+            )
+        bad = ~np.isfinite(values.reshape(len(values), -1)).all(1)
+        for row in np.flatnonzero(bad & self.running).tolist():
+            self.reasons.setdefault(
+                row,
+                f"{self._name} returned a non-finite {what} at step {step} under"
+                f" {self._physics[row]}",
+            )
+        if not bad.any():
+            return values
+        return np.where(bad.reshape(-1, *[1] * (values.ndim - 1)), instead, values)
+
+
+class InvalidEpisodes:
+    """Says which episodes are left out, until there are too many.
+
+    Args:
+        setting: The name of the limit.
+        allowed: How many may be left out.
+        say: Shows a line.
+    """
+
+    def __init__(self, setting: str, allowed: int, say: Callable[[str], None]):
+        self._setting, self._allowed, self._say = setting, allowed, say
+        self._reasons: list[str] = []
+
+    def leave_out(self, rollout: Rollout) -> None:
+        """Count the invalid episodes of a rollout.
+
+        Raises:
+            BadEnvironmentError: There are too many.
+        """
+        self._reasons += rollout.invalid.values()
+        if len(self._reasons) > self._allowed:
+            raise self.too_many()
+        for reason in rollout.invalid.values():
+            self._say(f"{reason}; the episode is dropped.")
+
+    def too_many(self) -> BadEnvironmentError:
+        """Word the error for more than allowed, or for all."""
+        return BadEnvironmentError(
+            f"{len(self._reasons)} episodes broke, allowed: {self._allowed} ({self._setting}), and"
+            f" not all; the first: {self._reasons[0]}. Mend the environment under these physics, or"
+            " allow more; then the same command goes on."
+        )

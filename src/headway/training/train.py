@@ -1,0 +1,367 @@
+"""The training loop: collect, fit, evaluate, save, and again (supplement A.2)."""
+
+import time
+from collections.abc import Iterable, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from headway.config import Config
+from headway.data import Trajectory
+from headway.errors import DivergenceError
+from headway.experiment.learners import Learned, make_learner
+from headway.models.updates import EpochStats
+from headway.training.collect import (
+    AgentPolicy,
+    Environments,
+    Episode,
+    InvalidEpisodes,
+    Rollout,
+    random_policy,
+    run_episodes,
+)
+from headway.training.evaluate import Tests, evaluate_agent
+from headway.training.loading import initial, load_learned
+from headway.training.progress import Progress
+from headway.training.run import Partial, RunDir, tree_arrays, tree_from_arrays
+from headway.training.stopping import StopRequest, stop_requests
+
+SAVE_EVERY = 30.0  # seconds between two writes of an unfinished fit
+MAX_SKIPPED = 0.5
+"""Share of an epoch's updates that may be skipped because their loss or gradient is not finite."""
+EXPLODED = 100.0
+"""A loss has exploded when it is above the iteration's best by this many times its size, or 1."""
+SLOWER = 0.25
+"""Factor on the step size with every roll-back."""
+MANY_MAPS = 30_000
+"""Half of the memory maps that Linux allows a process."""
+
+
+class Keys(NamedTuple):
+    """The random streams of one iteration, derived from the seed and the iteration alone."""
+
+    collect: PRNGKeyArray
+    fit: PRNGKeyArray
+    evaluate: PRNGKeyArray
+    diagnose: PRNGKeyArray
+
+    @classmethod
+    def of(cls, seed: int, iteration: int) -> "Keys":
+        """Independent of how often the run was interrupted before."""
+        return cls(*jax.random.split(jax.random.fold_in(jax.random.key(seed), iteration + 1), 4))
+
+
+def train_run(
+    config: Config,
+    run_dir: str | Path,
+    progress: Progress | None = None,
+    *,
+    resume_from_last_good: bool = False,
+) -> RunDir:
+    """Train until the last iteration, from wherever the run stands.
+
+    Ctrl-C and SIGTERM stop after a step or an epoch; what is finished is saved. Only one process
+    trains in a directory.
+
+    Args:
+        config: All settings.
+        run_dir: A new directory, or one with the same settings.
+        progress: Shown while training; silent by default.
+        resume_from_last_good: Where a file is damaged, forget the iterations that stand on it.
+
+    Raises:
+        ConfigError: The settings do not fit the environment.
+        RunError: The directory holds something else, is damaged, or in use.
+        LimitError: The disk is full; nothing is lost.
+        BadEnvironmentError: The environment broke its contract; what is finished is saved.
+        DivergenceError: Fitting diverged again and again.
+        KeyboardInterrupt: Ctrl-C was pressed.
+        Terminated: SIGTERM was sent.
+    """
+    run = RunDir(run_dir)
+    _forget_programs()
+    # A display begins once it is certain that the run does.
+    with run.locked(), progress or Progress() as shown, stop_requests() as stop:
+        if resume_from_last_good:
+            good = run.go_back()
+            shown.message(
+                "begins anew"
+                if good is None
+                else f"goes on after iteration {good}, which is intact"
+            )
+        with closing(Environments.make(config)) as environments:
+            run.begin(config)
+            _Training(config, run, environments, shown, stop).train()
+    return run
+
+
+class _Training:
+    """A run in progress.
+
+    Args:
+        config: All settings.
+        run: The directory, which is locked.
+        environments: Where it acts.
+        progress: What is told.
+        stop: Asks to stop.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        run: RunDir,
+        environments: Environments,
+        progress: Progress,
+        stop: StopRequest,
+    ):
+        self.config, self.run, self.environments = config, run, environments
+        self.progress, self.stop = progress, stop
+        self.learner = make_learner(config, environments.task, environments.episode_length)
+        self.data = run.load_data() if self.learner.learns else []
+        begun = run.finished_iterations > 0
+        self.learned = load_learned(run, config) if begun else initial(config, environments.task)
+
+    def train(self) -> None:
+        """Go through the iterations that are left; only the last write makes one count."""
+        config, run, learner = self.config, self.run, self.learner
+        todo = range(run.finished_iterations, config.collection.num_iterations)
+        for iteration in todo:
+            partial, keys = run.partial(), Keys.of(config.seed, iteration)
+            metrics: dict[str, Any] = {"iteration": iteration}
+            collected: list[Trajectory] = []
+            seconds = {}
+            if learner.learns:
+                rollout = self.collect(iteration, keys.collect, partial)
+                collected, seconds["collect"] = rollout.trajectories, rollout.seconds
+                self.data += collected
+                failures = {"planner_failures": rollout.use.failures}
+                metrics["collection"] = _summary(collected) | failures
+                metrics["fitting"], seconds["fit"] = self.fit(iteration, keys.fit, partial)
+            tests = self.evaluate(iteration, keys.evaluate, partial)
+            seconds["evaluate"] = tests.seconds
+            tested = tests.trajectories
+            metrics |= {
+                "timesteps": sum(map(len, self.data)),
+                "evaluation": {group: _summary(found) for group, found in tested.items()},
+                "test_planner_failures": tests.use.failures,
+                "seconds": {name: round(value, 3) for name, value in seconds.items()},
+            }
+            errors = {
+                group: learner.prediction_error(self.learned, found, keys.diagnose)
+                for group, found in tested.items()
+            }
+            shares = learner.head_shares(self.learned, self.data)
+            tables = {
+                "evaluation.csv": [row.to_csv() for row in tests.rows(config, iteration)],
+                "assignments.csv": [{"iteration": iteration, **row} for row in shares],
+                "prediction_error.csv": [
+                    {"iteration": iteration, "group": group, "step": step, "error": float(error)}
+                    for group, found in errors.items()
+                    for step, error in enumerate(found, start=1)
+                ],
+            }
+            run.save_iteration(metrics, self.learned, collected, tested, tables)
+            partial.remove()
+            self.progress.iteration_done(metrics)
+            self.stop.answer()
+        run.partial().remove()
+
+    def groups(self, iteration: int) -> list[str]:
+        """The groups that are tested after an iteration; often none."""
+        evaluation = self.config.evaluation
+        last = iteration == self.config.collection.num_iterations - 1
+        if not last and (iteration + 1) % evaluation.every:
+            return []
+        train, *unseen = self.environments.sim_params.group_names
+        with_train = last or evaluation.training_group == "always"
+        return [train, *unseen] if with_train else unseen
+
+    def begin_phase(self, iteration: int, name: str, work: int) -> None:
+        """Announce what comes next, and its environment steps or epochs."""
+        place = f"[{iteration + 1}/{self.config.collection.num_iterations}]"
+        self.progress.phase(f"{place} {name}", work)
+
+    def on_step(self, steps: int) -> None:
+        """Count environment steps; stop between two of them."""
+        self.progress.advance(steps)
+        self.stop.answer()
+
+    def collect(self, iteration: int, key: PRNGKeyArray, partial: Partial) -> Rollout:
+        """Run one episode in each environment, under physics drawn from the training set."""
+        config, environments = self.config.collection, self.environments
+        steps = config.num_episodes * environments.episode_length
+        self.begin_phase(iteration, "collect", steps)
+        kept = partial.load("collect")
+        if kept is not None:
+            self.progress.advance(steps)
+            return Rollout.from_part(*kept)
+        rng = np.random.default_rng([self.config.seed, iteration])
+        seeds = rng.integers(2**31 - 1, size=config.num_episodes)
+        episodes = [Episode(environments.sim_params.sample(rng), int(seed)) for seed in seeds]
+        if iteration == 0:
+            policy = random_policy(environments, rng)
+        else:
+            agent = self.learner.agent(self.learned, environments, self.data)
+            policy = AgentPolicy(agent, config.num_episodes, episodes, key=key)
+        rollout = run_episodes(environments, episodes, policy, self.on_step)
+        invalid = InvalidEpisodes(
+            "collection.max_bad_episodes", config.max_bad_episodes, self.progress.message
+        )
+        invalid.leave_out(rollout)
+        if not rollout.trajectories:
+            raise invalid.too_many()
+        partial.save("collect", *rollout.to_part())
+        return rollout
+
+    def fit(
+        self, iteration: int, key: PRNGKeyArray, partial: Partial
+    ) -> tuple[dict[str, Any], float]:
+        """Renew the statistics and go through the data `epochs` times.
+
+        An epoch that diverges is made again from where the last good one ended, with a smaller
+        step; the next iteration starts with the usual one.
+
+        Returns:
+            What is measured, and the seconds that it took, those of earlier attempts included.
+
+        Raises:
+            DivergenceError: It diverged again and again.
+        """
+        self.begin_phase(iteration, "fit", self.config.fitting.epochs)
+        state, rollbacks, seconds = self.learned.fit, 0, 0.0
+        history: list[EpochStats] = []
+        kept = partial.load("fit")
+        if kept is not None:
+            arrays, facts = kept
+            state = tree_from_arrays(state, arrays, partial.path("fit"))
+            history = [EpochStats(*row) for row in facts["history"]]
+            rollbacks, seconds = facts["rollbacks"], facts["seconds"]
+            self.progress.advance(len(history))
+        started = saved = time.perf_counter()
+        problem, learner = None, self.learner
+
+        def save() -> None:
+            rows = [[x.item() for x in map(np.asarray, epoch)] for epoch in history]
+            facts = {"history": rows, "rollbacks": rollbacks}
+            facts["seconds"] = seconds + time.perf_counter() - started
+            partial.save("fit", tree_arrays(state), facts)
+
+        while True:
+            if rollbacks:
+                learner = self.learner.slower(SLOWER**rollbacks)
+            fit = learner.fit(self.data, iteration, key)
+            for fitted, stats in fit.epochs(state, len(history)):
+                problem = divergence(stats, history)
+                if problem is not None:
+                    break
+                state = fitted
+                history.append(stats)
+                self.progress.advance(1, loss=float(stats.loss))
+                if self.stop or time.perf_counter() - saved >= SAVE_EVERY:
+                    save()
+                    saved = time.perf_counter()
+                self.stop.answer()
+            self.learned = Learned(state, fit.statistics)
+            if problem is None:
+                break
+            rollbacks += 1
+            epoch = f"epoch {len(history)} of iteration {iteration}"
+            if rollbacks > self.config.fitting.max_rollbacks:
+                where = first_non_finite(
+                    self.data, self.learner.head_losses(self.learned, self.data)
+                )
+                raise DivergenceError(
+                    f"{epoch} diverged {rollbacks} times: {problem} ({where}), allowed:"
+                    f" fitting.max_rollbacks ({rollbacks - 1}); try a smaller"
+                    " fitting.learning_rate in another directory."
+                )
+            self.progress.message(f"{epoch}: {problem}; made again with a smaller step.")
+            problem = None
+        save()
+        measured = {
+            "loss": float(history[-1].loss),
+            "forward_loss": float(history[-1].forward_loss),
+            "updates": sum(int(stats.updates) for stats in history),
+            "skipped_updates": sum(int(stats.skipped) for stats in history),
+            "rollbacks": rollbacks,
+            "transitions": sum(map(len, self.data)),
+        }
+        return measured, seconds + time.perf_counter() - started
+
+    def evaluate(self, iteration: int, key: PRNGKeyArray, partial: Partial) -> Tests:
+        """Test on the unseen groups, and on the training physics when the settings say so."""
+        groups = self.groups(iteration)
+        if not groups:
+            return Tests()
+        num_tests = len(groups) * self.config.evaluation.num_episodes
+        self.begin_phase(iteration, "evaluate", num_tests * self.environments.episode_length)
+        return evaluate_agent(
+            self.learner.agent(self.learned, self.environments, self.data),
+            self.environments,
+            self.config,
+            groups,
+            key=key,
+            progress=self.progress,
+            on_step=self.on_step,
+            partial=partial,
+        )
+
+
+def divergence(stats: EpochStats, before: Sequence[EpochStats]) -> str | None:
+    """Word what is wrong with an epoch, if anything is.
+
+    Args:
+        stats: Of the epoch.
+        before: Of the good epochs before it in the same iteration.
+    """
+    skipped, updates, loss = int(stats.skipped), int(stats.updates), float(stats.loss)
+    if skipped > MAX_SKIPPED * updates:
+        return f"{skipped} of {updates} updates had no finite loss and gradient"
+    best = min((float(epoch.loss) for epoch in before), default=loss)
+    if not np.isfinite(loss) or loss - best > EXPLODED * max(1.0, abs(best)):
+        return f"the loss rose from {best:.3g} to {loss:.3g}"
+    return None
+
+
+def first_non_finite(trajectories: Sequence[Trajectory], losses: Iterable[np.ndarray]) -> str:
+    """Name the first member, head and physics whose loss is not finite; or say there is none.
+
+    Args:
+        trajectories: What was fitted.
+        losses: Of each of them, [member, head, time].
+    """
+    for trajectory, loss in zip(trajectories, losses, strict=False):
+        bad = np.argwhere(~np.isfinite(loss))
+        if len(bad):
+            member, head, time = bad[0]
+            physics = dict(trajectory.sim_params)
+            return f"member {member}, head {head}, at step {time} under sim_params {physics}"
+    return "every member and head has a finite loss before the epoch"
+
+
+def _summary(trajectories: list[Trajectory]) -> dict[str, Any]:
+    returns = np.array([trajectory.returns for trajectory in trajectories])
+    return {
+        "returns": returns.tolist(),
+        "return_mean": float(returns.mean()),
+        "return_std": float(returns.std()),
+        "return_min": float(returns.min()),
+        "return_max": float(returns.max()),
+        "episodes": len(returns),
+    }
+
+
+def _forget_programs() -> None:
+    """Forget compiled programs before a process comes near to its limit of memory maps.
+
+    JAX keeps what it compiled for ever, which is about a thousand maps for a run, and crashes
+    beyond what Linux allows (65,530 by default). What is needed again is compiled again, or read
+    from the persistent cache.
+    """
+    maps = Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_bytes().splitlines()) > MANY_MAPS:
+        jax.clear_caches()

@@ -1,0 +1,83 @@
+"""Tiny runs: trained, compared, or written by hand."""
+
+import hashlib
+import json
+
+from headway.experiment.methods import make_config
+from headway.settings import to_dict
+from headway.training.progress import Progress
+from headway.training.run import SCHEMA, TABLES, RunDir, write_json
+
+TINY = {
+    "collection.episode_length": 12,
+    "collection.num_iterations": 3,
+    "fitting.epochs": 3,
+    "model.hidden_sizes": (8, 8),
+    "model.context_hidden_sizes": (8,),
+    "planner.num_candidates": 8,
+    "planner.horizon": 3,
+}
+
+
+def tiny_config(env="pendulum", method="tmcl", seed=0, **changes):
+    settings = {**TINY, **changes}
+    return make_config(env, method=method, preset="smoke", seed=seed, settings=settings)
+
+
+class Listening(Progress):
+    """Remembers what was said."""
+
+    def __init__(self):
+        self.said = []
+
+    def message(self, text):
+        self.said.append(text)
+
+
+def result(path):
+    """Everything that a run leaves behind, apart from times and what depends on them."""
+    RunDir(path).check()
+    files = [file for file in sorted(path.rglob("*")) if file.is_file() and file.name != ".lock"]
+    contents = {str(file.relative_to(path)): file.read_bytes() for file in files}
+    lines = contents.pop("metrics.jsonl").splitlines()
+    untimed = [{**json.loads(line), "seconds": None} for line in lines]
+    kept = {
+        name: None if name.startswith("checksums") else content
+        for name, content in contents.items()
+        if not name.startswith(("figures", "config.json"))
+    }
+    return untimed, kept
+
+
+def write_run(path, config, metrics, tables):
+    """Write a run that was never trained.
+
+    Args:
+        path: The run directory.
+        config: Its settings.
+        metrics: Lines of `metrics.jsonl`.
+        tables: Rows of the other tables, by file name.
+    """
+    write_json(path / "config.json", {"schema": SCHEMA, "config": to_dict(config)})
+    for line in metrics:
+        own = {
+            name: [row for row in rows if row["iteration"] == line["iteration"]]
+            for name, rows in tables.items()
+        }
+        RunDir(path).save_iteration(line, (), [], {}, own)
+    return path
+
+
+def accept_changes(path):
+    """Make a run's checksums fit tables that a test has changed, as far as they are there."""
+    lines = (path / "metrics.jsonl").read_text().splitlines()
+    for file in (path / "checksums").iterdir():
+        file.unlink()
+    found = {}
+    for name in ("config.json", "metrics.jsonl", *TABLES):
+        if (path / name).exists():
+            content = (path / name).read_bytes()
+            digest = hashlib.sha256(content).hexdigest()
+            found[name] = {"bytes": len(content), "sha256": digest}
+    if lines:
+        write_json(path / f"checksums/iteration-{len(lines) - 1:03d}.json", found)

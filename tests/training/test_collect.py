@@ -1,0 +1,207 @@
+"""Episodes side by side; environments that hang, crash, change or end at once."""
+
+import re
+
+import gymnasium
+import numpy as np
+import pytest
+
+import misbehaving
+import runs
+from headway.envs.classic import PendulumTask
+from headway.errors import BadEnvironmentError
+from headway.experiment.methods import make_config
+from headway.sim_params import SimParamSets
+from headway.task import EnvSpec, register
+from headway.training.collect import Environments, Episode, random_policy, run_episodes
+from headway.training.evaluate import run_tests
+from headway.training.run import RunDir
+from headway.training.train import train_run
+
+FAR = 5.0
+"""Physics of the tests only."""
+PROCESSES = {"collection.env_processes": True, "collection.step_timeout_s": 20.0}
+
+
+@pytest.fixture
+def drift():
+    """Registers an environment that misbehaves in some way; may be called again."""
+
+    def make(how="", **named):
+        gymnasium.registry.pop("own/Drift-v0", None)
+        gymnasium.register("own/Drift-v0", "misbehaving:Drift", kwargs={"how": how, **named})
+
+    make()
+    sets = SimParamSets({"drift": (0.5, 1.0)}, {"far": {"drift": (FAR,)}})
+    register(EnvSpec("drift", "own/Drift-v0", PendulumTask, sets, 6, {"drift": 0.5}))
+    yield make
+    del gymnasium.registry["own/Drift-v0"], task._registered["drift"]
+
+
+def config(**settings):
+    return runs.tiny_config("drift", **{"collection.episode_length": 6, **settings})
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    """A run without any misbehaviour, trained when it is first asked for."""
+    path = tmp_path_factory.mktemp("sound") / "run"
+
+    def result():
+        if not path.exists():
+            train_run(config(), path)
+        return runs.result(path)
+
+    return result
+
+
+def test_episodes_follow_their_own_schedules():
+    environments = Environments.make(make_config("pendulum", preset="smoke"))
+    length = {"length": 1.0, "mass": 1.0}
+    plain, changing = Episode(length, 1), Episode(length, 1, {5: {"length": 0.3}})
+
+    def roll_out(*episodes):
+        policy = random_policy(environments, np.random.default_rng(0))
+        return [t.obs for t in run_episodes(environments, episodes, policy).trajectories]
+
+    (first, second), (same, changed) = roll_out(plain, plain), roll_out(plain, changing)
+    np.testing.assert_array_equal(first, same)
+    np.testing.assert_array_equal(second[:6], changed[:6])
+    assert (second[6:] != changed[6:]).any(-1).all()
+
+
+def test_a_run_with_processes_equals_one_without(reference, tmp_path):
+    run = train_run(runs.tiny_config(**PROCESSES), tmp_path / "run")
+    assert run.config().collection.env_processes
+    assert runs.result(run.path) == runs.result(reference)
+
+
+INVALID = [
+    ("hang_in_c", {**PROCESSES, "collection.step_timeout_s": 1.0}, "did not answer to step"),
+    ("give_up", {}, "the robot fell apart"),
+    ("lose_a_number", {}, "returned a non-finite obs"),
+    ("pay_too_much", {}, "returned a non-finite reward"),
+]
+
+
+@pytest.mark.parametrize(("how", "settings", "says"), INVALID, ids=[how for how, *_ in INVALID])
+def test_an_invalid_episode_is_dropped_or_stops_the_run_and_loses_nothing(
+    how, settings, says, drift, sound, tmp_path
+):
+    wanted = sound()
+    drift(how, at=3, mark=str(tmp_path / "once"))
+    heard = runs.Listening()
+    run = train_run(config(**settings), tmp_path / "dropped", heard)
+    (said,) = heard.said
+    assert re.search(rf"{says}.*; the episode is dropped\.$", said)
+    assert "at step 3 under {'drift': " in said
+    whole = config().collection.num_episodes
+    assert [row["collection"]["episodes"] for row in run.metrics()] == [whole - 1, whole, whole]
+
+    (tmp_path / "once").unlink()
+    strict = config(**settings, **{"collection.max_bad_episodes": 0})
+    with pytest.raises(BadEnvironmentError, match=rf"1 episodes broke, allowed: 0 .*{says}"):
+        train_run(strict, tmp_path / "run")
+    drift()
+    train_run(config(), tmp_path / "run")  # in one process, now that it is mended
+    assert runs.result(tmp_path / "run") == wanted
+
+
+def test_tests_that_break_stop_the_run_until_they_may_be_left_out(drift, sound, tmp_path):
+    wanted = sound()
+    drift("give_up", drift=FAR)
+    for allowed, says in ((0, r"2 episodes broke, allowed: 0"), (99, "and not all")):
+        settings = config(**{"evaluation.max_bad_episodes": allowed})
+        with pytest.raises(BadEnvironmentError, match=says):
+            train_run(settings, tmp_path / "run")
+    drift()
+    train_run(config(), tmp_path / "run")  # what broke was not kept
+    assert runs.result(tmp_path / "run") == wanted
+
+    drift("give_up", drift=FAR, mark=str(tmp_path / "once"))
+    run = train_run(config(**{"evaluation.max_bad_episodes": 1}), tmp_path / "left out")
+    whole, left = (
+        [(row.iteration, row.group, row.episode) for row in one.evaluation()]
+        for one in (RunDir(tmp_path / "run"), run)
+    )
+    # The first one of the group broke; the others keep their numbers.
+    assert [row for row in whole if row != (0, "far", 0)] == left
+    (tmp_path / "once").unlink()
+    settings = {**PROCESSES, "evaluation.max_bad_episodes": 1}
+    again = run_tests(run.path, groups=["far"], settings=settings).tests.trajectories
+    assert len(again["far"]) == config().evaluation.num_episodes - 1
+
+
+STOPS = [
+    ("shrink", r"drift at step 3: an environment returned obs of shape \(2,\), allowed: \(3,\)"),
+    ("speak", r"drift returned obs of .* type <U\d+ at step \d, allowed: numbers"),
+    ("lose_the_reward", "returned the reward None, allowed: a number"),
+    ("fail", "drift raised ZeroDivisionError at step 3: a simulator failed"),
+    ("change_spaces", "drift at reset: .* has the .* space .*allowed: .* in every episode"),
+    ("change_actions", "drift at reset: .* has the .* space .*allowed: .* in every episode"),
+]
+
+
+@pytest.mark.parametrize("where", ["collection", "tests"])
+@pytest.mark.parametrize(("how", "says"), STOPS, ids=[how for how, _ in STOPS])
+def test_what_cannot_be_trusted_stops_the_run_with_the_reason(
+    where, how, says, drift, sound, tmp_path
+):
+    """In either place, with what was done before saved; mended, the same command goes on."""
+    wanted = sound()
+    at = 0 if how.startswith("change") else 3
+    drift(how, at=at, **({"drift": FAR} if where == "tests" else {}))
+    with pytest.raises(BadEnvironmentError, match=says) as caught:
+        train_run(config(), tmp_path / "run")
+    assert "\n" not in str(caught.value)
+    assert (tmp_path / "run/partial/fit.safetensors").exists() == (where == "tests")
+    drift()
+    train_run(config(), tmp_path / "run")
+    assert runs.result(tmp_path / "run") == wanted
+
+
+@pytest.mark.parametrize(("how", "length"), [("end", 1), ("cut", 1), ("count", 6)])
+def test_episodes_that_end_at_once_and_other_kinds_of_numbers_are_used(
+    how, length, drift, tmp_path
+):
+    """Whole numbers are numbers; and one transition is an episode, to learn from and to test."""
+    drift(how, at=1)
+    run = train_run(config(), tmp_path / "run")
+    assert {len(t) for t in run.load_data()} == {length}
+    assert {row.length for row in run.evaluation()} == {length}
+    assert {t.terminated for t in run.load_data()} == {how == "end"}
+    assert all(np.isfinite(row["fitting"]["loss"]) for row in run.metrics())
+
+
+def test_an_episode_that_mujoco_gives_up_is_left_out(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log there
+    sizes = {"collection.episode_length": 4, "collection.num_episodes": 3}
+    environments = Environments.make(runs.tiny_config("half-cheetah", **sizes))
+
+    def falling(obs):
+        action = np.zeros((3, environments.task.action_size), np.float32)
+        if not falling.begun:  # wild speeds in one of them
+            state = environments.vector.get_state(1)
+            state[9:18] = 1e12
+            environments.vector.set_state(1, state)
+        falling.begun = True
+        return random_policy(environments, np.random.default_rng(0))(obs)._replace(action=action)
+
+    falling.begun = False
+    physics = environments.sim_params.group("train")[0]
+    found = run_episodes(environments, [Episode(physics, seed) for seed in range(3)], falling)
+    assert found.invalid.keys() == {1}
+    assert "the simulation of half-cheetah diverged" in found.invalid[1]
+    assert [len(t) for t in found.trajectories] == [4, 4]
+    assert found.numbers == [0, 2]
+    environments.close()
+
+
+def test_the_environment_that_misbehaves_is_sound_when_it_does_not():
+    """Else the tests above would test something else."""
+    env = misbehaving.Drift()
+    first, _ = env.reset(seed=1, options={"sim_params": {"drift": 2.0}})
+    obs, reward, ends, cut, _ = env.step(np.ones(1, np.float32))
+    assert env.observation_space.contains(obs)
+    assert (reward, ends, cut) == (1.0, False, False)
+    assert (obs != first).all()

@@ -1,0 +1,84 @@
+"""Loading the controller of a run: another planner, a copy that lacks files, no simulator."""
+
+import dataclasses
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import headway
+from headway.errors import ConfigError, RunError
+from headway.training.run import RunDir
+
+OBS = np.array([1.0, 0.0, 0.0])
+
+
+def test_a_controller_can_have_another_planner(root):
+    settings = {"planner.num_candidates": 7, "planner.num_elites": 3}
+    planner = headway.load(root, settings=settings).agent.planner
+    wanted = dataclasses.replace(RunDir(root).config().planner, num_candidates=7, num_elites=3)
+    assert planner == wanted
+
+
+def test_a_controller_can_go_on_learning(root):
+    controller = headway.load(root, settings={"planner.adaptation": "last-layer"})
+    for _ in range(2):
+        controller.act(OBS)
+    assert controller.agent.prior is not None
+    assert np.abs(controller._state.learned.layer.weight).max() > 0
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"model.num_heads": 3}, "model.num_heads is fixed by training"),
+        ({"evaluation.num_episodes": 3}, "evaluation.num_episodes means nothing to a controller"),
+        ({"collection.max_bad_episodes": 3}, "collection.max_bad_episodes means nothing"),
+        ({"planner.num_candidate": 3}, "unknown setting .* Did you mean 'planner.num_candidates'"),
+        ({"planner.num_candidates": 0}, "bad planner settings: num_candidates is 0"),
+    ],
+)
+def test_what_a_controller_cannot_use_is_refused(settings, message, root):
+    with pytest.raises(ConfigError, match=message):
+        headway.load(root, settings=settings)
+
+
+SERVED = ("config.json", "checksums/iteration-001.json", "checkpoints/iteration-001.safetensors")
+
+
+def copy_of(root: Path, names) -> Path:
+    """A run directory with some files of another one."""
+    place = root.with_name("copy")
+    for name in names:
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(root / name, place / name)
+    return place
+
+
+def test_a_copy_without_tables_and_data_serves(root):
+    copy = copy_of(root, SERVED)
+    np.testing.assert_array_equal(headway.load(copy).act(OBS), headway.load(root).act(OBS))
+
+
+@pytest.mark.parametrize("missing", SERVED)
+def test_a_file_that_a_copy_lacks_is_named(missing, root):
+    copy = copy_of(root, [name for name in SERVED if name != missing])
+    with pytest.raises(RunError, match=missing.split("/")[0]) as caught:
+        headway.load(copy)
+    assert "go on training" not in str(caught.value)
+
+
+def test_learning_on_needs_the_data_as_well(root):
+    with pytest.raises(RunError, match="data/iteration-000"):
+        headway.load(copy_of(root, SERVED), settings={"planner.adaptation": "last-layer"})
+
+
+def test_a_controller_is_loaded_without_a_simulator(root):
+    code = f"import headway, sys; headway.load({str(root)!r}); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert "headway.planning.controller" in loaded
+    assert not {"gymnasium", "mujoco", "matplotlib"} & loaded

@@ -1,0 +1,305 @@
+"""The run directory: checksums, going back, one process at a time, nothing half-written."""
+
+import ast
+import errno
+import fcntl
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import headway
+import runs
+from headway.errors import BusyError, RunError
+from headway.training import run as run_module
+from headway.training.loading import load_task
+from headway.training.run import RunDir, load_arrays, save_arrays, write_bytes
+from headway.training.train import train_run
+
+FILES = [
+    "config.json",
+    "metrics.jsonl",
+    "evaluation.csv",
+    "assignments.csv",
+    "prediction_error.csv",
+    "data/iteration-000.safetensors",
+    "data/iteration-001.safetensors",
+    "tests/iteration-001.safetensors",
+    "checkpoints/iteration-001.safetensors",
+]
+NEWEST = "checksums/iteration-001.json"
+
+
+def refused(read, *args) -> str:
+    """The one line with which reading fails."""
+    with pytest.raises(RunError) as caught:
+        read(*args)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert len(text) < 1000
+    return text
+
+
+def flip(path):
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+
+
+DAMAGE = {
+    "flipped": flip,
+    "cut": lambda path: path.write_bytes(path.read_bytes()[:-1]),
+    "empty": lambda path: path.write_bytes(b""),
+    "gone": Path.unlink,
+}
+
+
+@pytest.mark.parametrize("how", DAMAGE)
+@pytest.mark.parametrize("name", FILES)
+def test_damage_to_any_file_is_named_with_the_way_back(name, how, root):
+    DAMAGE[how](root / name)
+    text = refused(RunDir(root).check)
+    assert Path(name).name in text
+    if "001" in name:
+        assert "last good iteration is 0" in text
+        assert "--resume-from-last-good" in text
+
+
+@pytest.mark.parametrize("how", ["flipped", "empty"])
+def test_damaged_checksums_are_noticed(how, root):
+    DAMAGE[how](root / NEWEST)
+    refused(RunDir(root).check)
+
+
+@pytest.mark.parametrize("name", [*FILES[-4:], NEWEST])
+def test_a_run_goes_on_from_its_last_good_iteration(name, root, reference):
+    flip(root / name)
+    with pytest.raises(RunError, match=r"last good iteration is 0|No earlier iteration"):
+        train_run(runs.tiny_config(), root)
+    if "data/iteration-000" in name:
+        with pytest.raises(RunError, match="no intact iteration"):
+            train_run(runs.tiny_config(), root, resume_from_last_good=True)
+        return
+    heard = runs.Listening()
+    train_run(runs.tiny_config(), root, heard, resume_from_last_good=True)
+    assert heard.said == ["goes on after iteration 0, which is intact"]
+    assert runs.result(root) == runs.result(reference)
+
+
+def test_an_intact_run_is_not_gone_back_from(root):
+    assert RunDir(root).go_back() == 1
+    assert (root / NEWEST).exists()
+
+
+def test_lost_checksums_do_not_begin_a_run_anew(root):
+    for path in (root / "checksums").iterdir():
+        path.unlink()
+    with pytest.raises(RunError, match=r"holds 0 iterations, but the checkpoint of iteration 1"):
+        train_run(runs.tiny_config(), root)
+    assert (root / "checkpoints/iteration-001.safetensors").exists()
+
+
+def test_a_damaged_checkpoint_is_not_loaded(root):
+    flip(root / "checkpoints/iteration-001.safetensors")
+    with pytest.raises(RunError, match=r"damaged.*--resume-from-last-good"):
+        headway.load(root)
+
+
+def test_a_checkpoint_of_another_model_is_refused(root):
+    config = runs.tiny_config(**{"model.hidden_sizes": (9, 9)})
+    with pytest.raises(RunError, match="belongs to another model"):
+        headway.training.loading.load_learned(RunDir(root), config)
+
+
+def test_what_is_read_is_what_was_written(root):
+    run = RunDir(root)
+    assert [row["iteration"] for row in run.metrics()] == [0, 1]
+    tests = run.tests()
+    rows = [row for row in run.evaluation() if row.iteration == 1]
+    found = [(group, t.returns, len(t)) for group, ts in tests.items() for t in ts]
+    assert found == [(row.group, row.episode_return, row.length) for row in rows]
+    assert [dict(t.sim_params) for t in tests["low"]] == [
+        dict(row.sim_params) for row in rows if row.group == "low"
+    ]
+    assert len(run.load_data()) == 4
+    assert sum(len(t) for t in run.load_data()) == run.metrics()[-1]["timesteps"]
+    assert {row["iteration"] for row in run.assignments() + run.prediction_errors()} == {0, 1}
+
+
+def test_rows_of_an_unfinished_iteration_do_not_count(root, reference):
+    for name in FILES[1:5]:
+        with (root / name).open("a") as table:
+            table.write("half a line")
+    assert len(RunDir(root).metrics()) == 2
+    train_run(runs.tiny_config(), root)
+    assert runs.result(root) == runs.result(reference)
+
+
+def test_settings_versions_and_commit_are_kept(root):
+    found = RunDir(root).metadata()
+    assert RunDir(root).config() == runs.tiny_config()
+    assert found["versions"]["jax"] == jax.__version__
+    checkout = Path(headway.__file__).parents[2]
+    if (checkout / ".git").exists():
+        words = ["git", "-C", str(checkout), "rev-parse", "HEAD"]
+        assert found["commit"] == subprocess.check_output(words, text=True).strip()
+
+
+def test_another_schema_is_refused_with_the_reason(root):
+    values = json.loads((root / "config.json").read_text())
+    (root / "config.json").write_text(json.dumps({**values, "schema": 2}))
+    assert "schema 2, allowed: 3; train the run again" in refused(RunDir(root).config)
+
+
+def test_other_settings_are_refused_with_the_difference(root):
+    with pytest.raises(RunError, match=r"planner\.horizon: 3 -> 5"):
+        train_run(runs.tiny_config(**{"planner.horizon": 5}), root)
+
+
+def test_what_is_no_run_is_left_alone(tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(RunError, match="holds no run"):
+        train_run(runs.tiny_config(), tmp_path)
+    with pytest.raises(RunError, match="is a file, allowed: a directory"):
+        train_run(runs.tiny_config(), tmp_path / "thesis.txt")
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+HOLD = """
+import sys
+from headway.training.run import RunDir
+with RunDir(sys.argv[1]).locked():
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_second_process_is_refused_until_the_first_is_killed(root):
+    words = [sys.executable, "-c", HOLD, str(root)]
+    first = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert first.stdout.readline() == "held\n"
+        with pytest.raises(BusyError, match="is being trained by another"), RunDir(root).locked():
+            pass
+    finally:
+        first.kill()
+        first.communicate()
+    with RunDir(root).locked():
+        pass
+
+
+@pytest.mark.parametrize("missing", [errno.ENOSYS, errno.ENOLCK])
+@pytest.mark.filterwarnings("ignore:flock not supported")
+def test_without_locks_a_run_works_or_is_refused_in_one_line(missing, root, monkeypatch):
+    def no_lock(*_):
+        raise OSError(missing, os.strerror(missing))
+
+    monkeypatch.setattr(fcntl, "flock", no_lock)
+    if missing == errno.ENOSYS:
+        with RunDir(root / "new").locked():
+            pass
+        return
+    with pytest.raises(RunError, match="cannot be written: No locks"), RunDir(root).locked():
+        pass
+
+
+def test_folders_that_cannot_be_synced_are_written_to(tmp_path, monkeypatch):
+    plain = os.fsync
+
+    def files_only(handle):
+        if os.path.isdir(f"/proc/self/fd/{handle}"):  # noqa: PTH112
+            raise OSError(errno.EINVAL, "Invalid argument")
+        plain(handle)
+
+    monkeypatch.setattr(os, "fsync", files_only)
+    write_bytes(tmp_path / "new/file", b"content")
+    assert (tmp_path / "new/file").read_bytes() == b"content"
+
+
+@pytest.mark.parametrize("name", ["fifo", "folder", ".", "link"])
+def test_only_regular_files_are_replaced(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("fifo")
+    Path("folder").mkdir()
+    Path("link").symlink_to("fifo")
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(RunError, match=r"is no regular file, allowed: .*; choose another name\.$"):
+        write_bytes(Path(name), b"content")
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_writing_does_not_follow_a_link_that_lies_in_wait(tmp_path):
+    victim = tmp_path / "victim.txt"
+    victim.write_text("mine")
+    (tmp_path / ".table.csv.writing").symlink_to(victim)
+    write_bytes(tmp_path / "table.csv", b"rows")
+    assert victim.read_text() == "mine"
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    return tmp_path_factory.mktemp("any") / "file"
+
+
+@given(content=st.binary(max_size=200))
+def test_any_bytes_are_refused_in_one_line(file, content):
+    file.write_bytes(content)
+    refused(load_arrays, file)
+
+
+@given(
+    st.dictionaries(
+        st.text(st.characters(codec="ascii"), min_size=1, max_size=5),
+        st.lists(st.integers(0, 4), max_size=3),
+        max_size=4,
+    )
+)
+def test_arrays_that_were_saved_are_read(file, shapes):
+    made = {name: np.random.default_rng(0).normal(size=shape) for name, shape in shapes.items()}
+    save_arrays(file, made, {"note": 1.5})
+    found, facts = load_arrays(file)
+    assert facts == {"note": 1.5}
+    assert set(found) == set(made)
+    assert all(np.array_equal(found[name], made[name]) for name in made)
+
+
+def test_keys_and_weights_of_a_pytree_come_back(tmp_path):
+    tree = {"key": jax.random.key(3), "rest": [np.arange(3.0, dtype=np.float32)]}
+    path = tmp_path / "tree.safetensors"
+    save_arrays(path, run_module.tree_arrays(tree))
+    back = run_module.tree_from_arrays(tree, load_arrays(path)[0], path)
+    assert (jax.random.key_data(back["key"]) == jax.random.key_data(tree["key"])).all()
+    np.testing.assert_array_equal(back["rest"][0], tree["rest"][0])
+
+
+@pytest.mark.parametrize("env", ["os:system", "headway.api:train", "../pendulum"])
+def test_settings_of_a_run_never_name_code(env, root):
+    values = json.loads((root / "config.json").read_text())
+    values["config"]["env"] = env
+    (root / "config.json").write_text(json.dumps(values))
+    with pytest.raises(headway.HeadwayError):
+        load_task(RunDir(root).config())
+
+
+PICKLES = {"pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve", "yaml", "torch"}
+EVALUATING = {"eval", "exec", "compile", "__import__"}
+
+
+def test_nothing_in_the_package_can_turn_a_file_into_code():
+    for path in Path(headway.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                assert not {name.name.partition(".")[0] for name in node.names} & PICKLES, path
+            if isinstance(node, ast.ImportFrom):
+                assert (node.module or "").partition(".")[0] not in PICKLES, path
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                assert node.func.id not in EVALUATING, path
+            if isinstance(node, ast.keyword):
+                assert node.arg not in ("allow_pickle", "shell"), path

@@ -1,0 +1,281 @@
+"""The whole loop, at smoke size: every environment, repeatability, divergence, early endings."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import headway
+import runs
+from headway.data import Trajectory
+from headway.errors import ConfigError, DivergenceError, PlanningError, UnknownNameError
+from headway.experiment.learners import Learned
+from headway.experiment.methods import make_config
+from headway.models.updates import EpochStats
+from headway.task import env_names
+from headway.training import loading, train
+from headway.training.collect import Environments
+from headway.training.run import RunDir
+
+
+def marked(env: str):
+    """Other methods run on these by default (`test_every_pair`, `test_adaptive_methods`)."""
+    return pytest.param(env, marks=pytest.mark.slow if env in ("hopper", "slim-humanoid") else ())
+
+
+@pytest.mark.parametrize("env", [marked(env) for env in env_names()])
+def test_smoke_run_and_evaluation_of_every_unseen_group(env, tmp_path):
+    run = headway.train(env, preset="smoke", seed=1, run_dir=tmp_path / env)
+    assert [m["iteration"] for m in run.metrics] == [0, 1]
+    assert np.isfinite([m["fitting"]["loss"] for m in run.metrics]).all()
+    assert all(path.exists() for path in run.figures)
+    assert len(run.figures) == 4
+    spec = headway.env_spec(env)
+    for group in spec.sim_params.unseen:
+        rows = headway.evaluate(run.path, groups=[group], num_episodes=2)
+        assert [row.group for row in rows] == [group] * 2
+        assert all(dict(row.sim_params) in spec.sim_params.group(group) for row in rows)
+        assert np.isfinite([row.episode_return for row in rows]).all()
+
+
+def test_groups_are_tested_when_the_settings_say(reference):
+    rows = RunDir(reference).evaluation()
+    assert [(i, sum(row.iteration == i for row in rows)) for i in range(3)] == [
+        (0, 2 * 2),  # low and high
+        (1, 2 * 2),
+        (2, 3 * 2),  # training physics at the end
+    ]
+
+
+def test_a_seed_makes_a_run_and_a_finished_run_is_left_alone(reference, tmp_path):
+    wanted = runs.result(reference)
+    train.train_run(runs.tiny_config(), tmp_path / "again")
+    train.train_run(runs.tiny_config(), tmp_path / "again")
+    assert runs.result(tmp_path / "again") == wanted
+    train.train_run(runs.tiny_config(seed=7), tmp_path / "other")
+    assert runs.result(tmp_path / "other")[0] != wanted[0]
+
+
+def test_environments_are_closed_where_nothing_comes_of_a_run(root, monkeypatch):
+    """They may be processes, which would stay for as long as somebody keeps the error."""
+    made, closed = [], []
+    make, close = Environments.make, Environments.close
+    monkeypatch.setattr(Environments, "make", lambda config: made.append(make(config)) or made[-1])
+    monkeypatch.setattr(Environments, "close", lambda one: closed.append(one) or close(one))
+    with pytest.raises(headway.RunError):
+        train.train_run(runs.tiny_config(seed=1), root)
+    with pytest.raises(UnknownNameError):
+        headway.evaluate(root, groups=["highest"])
+    train.train_run(runs.tiny_config(), root)
+    assert len(made) == len(closed) == 3
+
+
+def test_episodes_that_end_early_are_learned_from(tmp_path):
+    settings = {
+        "env_options": {"terminate_off_track": True},
+        "collection.episode_length": 250,
+        "collection.num_episodes": 3,
+        "evaluation.num_episodes": 3,
+    }
+    config = make_config("cartpole-swingup", preset="smoke", seed=3, settings=settings)
+    run = train.train_run(config, tmp_path / "run")
+    trajectories = run.load_data()
+    lengths = [len(trajectory) for trajectory in trajectories]
+    assert min(lengths) < 250
+    for trajectory in trajectories:
+        assert trajectory.terminated == (abs(trajectory.obs[-1, 0]) > np.float32(2.4))
+        assert trajectory.terminated or len(trajectory) == 250
+    assert {row.length for row in run.evaluation()} - {250}
+    assert run.metrics()[-1]["fitting"]["transitions"] == sum(lengths)
+
+
+@pytest.mark.parametrize(
+    ("settings", "evaluations"),
+    [
+        ({}, 2 * 8),
+        ({"planner.num_candidates": 6}, 2 * 6),
+        ({"planner.optimizer": "mppi", "planner.num_iterations": 3}, 3 * 8),
+    ],
+)
+def test_a_run_can_be_tested_with_another_planner(settings, evaluations, reference):
+    before = runs.result(reference)
+    found = headway.evaluate(reference, groups=["low"], num_episodes=3, settings=settings)
+    assert [row.group for row in found] == ["low"] * 3
+    assert found.cost.evaluations_per_step == evaluations
+    rows_per_step = evaluations * 2 * 3  # particles, horizon
+    assert found.cost.flop_per_step == rows_per_step * 2 * (4 * 8 + 8 * 8 + 8 * 6)
+    assert 0 < found.cost.seconds_per_step < 60
+    assert runs.result(reference) == before
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"model.num_heads": 2}, r"model\.num_heads is fixed by training, allowed:"),
+        ({"planer.horizon": 2}, r"Did you mean 'planner\.horizon'"),
+        ({"planner.num_candidates": 3}, r"num_elites is 4, allowed: at most num_cand"),
+    ],
+)
+def test_what_training_has_fixed_cannot_be_changed_by_a_test(settings, says, reference):
+    with pytest.raises(ConfigError, match=says):
+        headway.evaluate(reference, settings=settings)
+
+
+def test_controller_stays_in_bounds_names_its_heads_and_forgets(reference):
+    fresh, controller = headway.load(reference), headway.load(reference)
+    assert controller.heads is None
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        action = controller.act(rng.uniform(-1, 1, 3))
+        assert action.shape == (1,)
+        assert np.abs(action) <= 2.0
+    assert controller.heads.shape == (2,)
+    assert set(controller.heads) <= {0, 1, 2}
+    obs = np.array([1.0, 0.0, 0.5])
+    controller.reset()
+    fresh.reset()
+    assert np.array_equal(fresh.act(obs), controller.act(obs))
+
+
+@pytest.mark.parametrize(
+    ("obs", "error", "says"),
+    [
+        (np.zeros(4), ConfigError, r"\(4,\), allowed: \(3,\)"),
+        (np.array([0, np.nan, 0]), PlanningError, r"obs\[1\] is nan"),
+    ],
+)
+def test_bad_observation_is_refused(obs, error, says, reference):
+    with pytest.raises(error, match=says):
+        headway.load(reference).act(obs)
+
+
+def test_heads_of_a_run_share_every_segment(reference):
+    totals: dict = {}
+    for row in RunDir(reference).assignments():
+        place = row["iteration"], row["member"], row["sim_params"]
+        totals[place] = totals.get(place, 0.0) + row["share"]
+    assert totals
+    assert np.allclose(list(totals.values()), 1.0)
+
+
+def stats(loss=1.0, skipped=0, updates=10):
+    return EpochStats(*(np.asarray(x) for x in (loss, loss, skipped, updates)))
+
+
+@pytest.mark.parametrize(
+    ("epoch", "before", "problem"),
+    [
+        (stats(), [0.5, 2.0], None),
+        (stats(skipped=5), [0.5, 2.0], None),
+        (stats(skipped=6), [0.5, 2.0], "6 of 10 updates had no finite loss and gradient"),
+        (stats(90.0), [0.5, 2.0], None),
+        (stats(110.0), [0.5, 2.0], "the loss rose from 0.5 to 110"),
+        (stats(float("nan")), [0.5, 2.0], "the loss rose from 0.5 to nan"),
+        (stats(1e9), [], None),
+    ],
+)
+def test_what_counts_as_divergence(epoch, before, problem):
+    assert train.divergence(epoch, [stats(loss) for loss in before]) == problem
+
+
+def diverge(monkeypatch, is_bad):
+    """Let epochs diverge by the number of their look, from 1."""
+    plain, looks = train.divergence, []
+
+    def divergence(epoch, before):
+        looks.append(1)
+        return "the loss rose" if is_bad(len(looks)) else plain(epoch, before)
+
+    monkeypatch.setattr(train, "divergence", divergence)
+
+
+def test_a_diverging_epoch_is_made_again_with_a_smaller_step(reference, tmp_path, monkeypatch):
+    diverge(monkeypatch, lambda look: look in (5, 6))  # second epoch of the second iteration
+    heard = runs.Listening()
+    run = train.train_run(runs.tiny_config(), tmp_path / "run", heard)
+    assert [row["fitting"]["rollbacks"] for row in run.metrics()] == [0, 2, 0]
+    says = "epoch 1 of iteration 1: the loss rose; made again with a smaller step."
+    assert heard.said == [says, says]
+    usual = RunDir(reference).metrics()
+    assert run.metrics()[0]["fitting"] == usual[0]["fitting"]
+    assert run.metrics()[1]["fitting"]["loss"] != usual[1]["fitting"]["loss"]
+
+
+def test_what_diverges_for_good_stops_with_all_that_was_good(reference, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        diverge(patch, lambda look: look >= 5)
+        with pytest.raises(DivergenceError, match="epoch 1 of iteration 1 diverged 4 times") as e:
+            train.train_run(runs.tiny_config(), tmp_path / "run")
+    assert "every member and head has a finite loss before" in str(e.value)
+    train.train_run(runs.tiny_config(), tmp_path / "run")
+    assert runs.result(tmp_path / "run") == runs.result(reference)
+
+
+def fresh_model():
+    config = runs.tiny_config(**{"fitting.weight_decay": 0.0})
+    task = loading.load_task(config)
+    return loading.learner_of(config, task), loading.initial(config, task)
+
+
+def with_bias(learned, at, value):
+    heads = learned.fit.model.forward_net.mean_heads
+    bias = heads.bias.at[at].set(value)
+    model = jax.tree.map(lambda x: bias if x is heads.bias else x, learned.fit.model)
+    return Learned(dataclasses.replace(learned.fit, model=model), learned.statistics)
+
+
+def episodes(scale=1.0, steps=6, *, constant=False, dtype=np.float32):
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(3):
+        obs = scale * rng.normal(size=(steps + 1, 3))
+        if constant:
+            obs[:, 2] = scale
+        action = rng.uniform(-1, 1, (steps, 1)).astype(np.float32)
+        found.append(Trajectory(obs.astype(dtype), action, np.zeros(steps), {"length": 1.0}))
+    return found
+
+
+def test_the_member_the_head_and_the_physics_of_a_divergence_are_named():
+    learner, learned = fresh_model()
+    learned = with_bias(learned, (1, 2), np.nan)
+    found = train.first_non_finite(episodes(), list(learner.head_losses(learned, episodes())))
+    assert found == "member 1, head 2, at step 0 under sim_params {'length': 1.0}"
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"scale": 1e8}, {"scale": 1e-8}, {"constant": True}, {"steps": 1}, {"dtype": np.float64}],
+    ids=str,
+)
+def test_odd_data_are_fitted_with_finite_numbers(settings):
+    learner, learned = fresh_model()
+    fit = learner.fit(episodes(**settings), 5, jax.random.key(0))
+    for state, found in fit.epochs(learned.fit, 0):
+        assert int(found.skipped) == 0
+        assert np.isfinite(found.loss)
+        assert all(np.isfinite(x).all() for x in jax.tree.leaves(state.model))
+
+
+def test_a_head_that_wins_nothing_is_harmless():
+    """It keeps its weights but for weight decay, owns nothing, and the agent acts without it."""
+    learner, learned = fresh_model()
+    learned = with_bias(learned, (slice(None), 1), 1e3)
+    before = learned.fit.model.forward_net.mean_heads
+    data = [t for steps in (6, 1, 3) for t in episodes(steps=steps)]
+    fit = learner.fit(data, 5, jax.random.key(0))
+    for state, found in fit.epochs(learned.fit, 0):
+        assert int(found.skipped) == 0
+        learned = Learned(state, fit.statistics)
+    after = learned.fit.model.forward_net.mean_heads
+    np.testing.assert_array_equal(after.bias[:, 1], 1e3)
+    np.testing.assert_array_equal(after.weight[:, 1], before.weight[:, 1])
+    assert (after.weight[:, [0, 2]] != before.weight[:, [0, 2]]).any((1, 2, 3)).all()
+    shares = learner.head_shares(learned, data)
+    assert {row["share"] for row in shares if row["head"] == 1} == {0.0}
+    agent = learner.agent(learned)
+    state = agent.init(1, key=jax.random.key(0))
+    for obs in data[0].obs[:3]:
+        state, decision = agent.act(state, obs[None])
+        assert np.isfinite(decision.action).all()
