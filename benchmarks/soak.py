@@ -17,10 +17,10 @@ import jax
 import numpy as np
 
 from headway.errors import PlanningError
-from headway.training.loading import initial, learner_of, load_task
 from headway.experiment.methods import make_config
 from headway.planning import agent as agent_module
 from headway.planning.controller import Controller
+from headway.training.loading import initial, learner_of, load_task
 
 REPORTS = 20
 WARM_UP = 2000

@@ -18,9 +18,8 @@ from headway import settings
 from headway.config import Config
 from headway.experiment.methods import make_config
 from headway.storage.iterations import manifest_name
-from headway.training.run import RunDir
-from headway.training.run import TABLES
 from headway.sweeps.jobs import fingerprint
+from headway.training.run import TABLES, RunDir
 
 
 def keep(run: RunDir, folder: Path, shared: Mapping[str, Any] | None = None) -> Path:

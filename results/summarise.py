@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from headway.config import Config
-from headway.training.references import score_of
 from headway.storage.records import read_csv
-from headway.training.run import RunDir
-from headway.training.run import EVALUATION_COLUMNS, EpisodeRow, format_sim_params
+from headway.training.references import score_of
+from headway.training.run import EVALUATION_COLUMNS, EpisodeRow, RunDir, format_sim_params
 
 Means = dict[tuple[bool, str], tuple[float, float]]
 """Return and score by physics, which is unseen or not."""

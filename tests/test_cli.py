@@ -12,6 +12,7 @@ from headway import api
 from headway.cli import COMMANDS, main, parse, read_seeds, read_settings
 from headway.errors import ConfigError, RunError
 from headway.experiment.methods import METHODS, PRESETS, make_config
+from headway.lab import figures
 from headway.training.evaluate import PlanningCost
 from headway.training.run import EpisodeRow, RunDir
 from headway.training.stopping import Terminated
@@ -54,13 +55,14 @@ def calls(monkeypatch, tmp_path):
         config = make_config(env, method=asked["method"], preset=asked["preset"])
         metrics = [{"timesteps": 100}, {"timesteps": 200}]
         rows = [episode("train", 0.5, 0.0, iteration=0), *ROWS]
-        return api.Run(tmp_path / "run", config, metrics, rows, [tmp_path / "a.png"])
+        return api.Run(tmp_path / "run", config, metrics, rows)
 
     def evaluate(run_dir, **asked):
         made.append({"run_dir": str(run_dir), **asked})
         cost = PlanningCost(300.0, 2.5e9, 0.0125)
         return api.Evaluation(ROWS, make_config("pendulum"), cost)
 
+    monkeypatch.setattr(figures, "save_run_figures", lambda path: [path.parent / "a.png"])
     monkeypatch.setattr(api, "train", train)
     monkeypatch.setattr(api, "evaluate", evaluate)
     return made

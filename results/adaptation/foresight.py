@@ -17,12 +17,12 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from measure import name_of
 
 from headway.config import PlannerConfig
-from headway.training.loading import load_learned, load_task
 from headway.planning.last_layer import foresight
 from headway.planning.last_layer.prior import fit_prior, foreseen_errors
 from headway.planning.last_layer.residuals import Onlooker
 from headway.report import style
 from headway.storage.records import read_csv, write_csv
+from headway.training.loading import load_learned, load_task
 from headway.training.run import RunDir
 
 COLUMNS = ("run", "env", "method", "head", "power", "ratio", "relative_error", "likelihood_ratio")

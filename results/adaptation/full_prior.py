@@ -19,9 +19,9 @@ from second_layer import AHEAD, MOMENTS, RANKS, Eyes
 from threadpoolctl import threadpool_limits
 
 from headway.data import Trajectory
-from headway.training.loading import load_learned, load_task
 from headway.planning.last_layer.evidence import MIN_NOISE, Evidence
 from headway.storage.records import write_csv
+from headway.training.loading import load_learned, load_task
 from headway.training.run import RunDir
 
 STEPS = (0, 1, 2, 5, 10, 20)

@@ -19,9 +19,8 @@ from headway.config import Config
 from headway.report.tables import by_physics
 from headway.settings import override
 from headway.storage.records import read_csv, write_csv
-from headway.training.run import RunDir
-from headway.training.run import EVALUATION_COLUMNS, EpisodeRow
 from headway.training.progress import make_progress
+from headway.training.run import EVALUATION_COLUMNS, EpisodeRow, RunDir
 
 COLUMNS = (
     "run", "env", "method", "seed", "arm", "group", "sim_params", "settings", "episodes",

@@ -16,9 +16,9 @@ from measure import ARMS, name_of
 
 from headway.data import Trajectory
 from headway.experiment.methods import config_to_control
-from headway.training.evaluate import run_tests
 from headway.report.diagnosis import examined
 from headway.storage.records import read_csv, write_csv
+from headway.training.evaluate import run_tests
 from headway.training.run import RunDir
 
 COLUMNS = (

@@ -5,15 +5,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
 
+import numpy as np
+
 from headway.config import Config
 from headway.experiment.methods import make_config
 from headway.models.compilation import prepare_jax
 from headway.planning.controller import Controller
-from headway.report.figures import save_run_figures
 from headway.service import load
 from headway.training.evaluate import PlanningCost, run_tests
 from headway.training.progress import Progress
-from headway.training.run import EpisodeRow
+from headway.training.run import EpisodeRow, format_sim_params
 from headway.training.train import train_run
 
 
@@ -29,8 +30,6 @@ class Run:
     """One entry per iteration, as in `metrics.jsonl`."""
     evaluation: list[EpisodeRow]
     """Every test episode, as in `evaluation.csv`."""
-    figures: list[Path]
-    """The figures made after training."""
 
     def controller(self, *, seed: int = 0, **options: Any) -> Controller:
         """The trained controller; options are those of `load`."""
@@ -41,7 +40,7 @@ class Run:
         config, last = self.config, max((row.iteration for row in self.evaluation), default=0)
         tests = [row for row in self.evaluation if row.iteration == last]
         what = f"{config.method} on {config.env}, seed {config.seed}"
-        what += f", {len(self.metrics)} iterations{_told(tests, config)}"
+        what += f", {len(self.metrics)} iterations{_told(tests)}"
         return f"Run({str(self.path)!r}: {what})"
 
 
@@ -69,18 +68,19 @@ class Evaluation(Sequence[EpisodeRow]):
     def __repr__(self) -> str:
         """How each group went; the fields say more."""
         what = f"{self.config.method} on {self.config.env}, {len(self)} episodes"
-        return f"Evaluation({what}{_told(self.rows, self.config)})"
+        return f"Evaluation({what}{_told(self.rows)})"
 
 
-def _told(rows: Sequence[EpisodeRow], config: Config) -> str:
-    """Mean return and score of each group in a few words."""
-    from headway.report.tables import by_group
-
-    text = ""
-    for group in by_group(rows, config):
-        score = "" if group["score"] is None else f" (score {group['score']:.2f})"
-        text += f"; {group['group']} {group['return_mean']:,.1f}{score}"
-    return text
+def _told(rows: Sequence[EpisodeRow]) -> str:
+    """Mean return of each group in a few words; every physics of it counts once."""
+    groups: dict[str, dict[str, list[float]]] = {}
+    for row in rows:
+        physics = groups.setdefault(row.group, {})
+        physics.setdefault(format_sim_params(row.sim_params), []).append(row.episode_return)
+    return "".join(
+        f"; {group} {np.mean([np.mean(returns) for returns in physics.values()]):,.1f}"
+        for group, physics in groups.items()
+    )
 
 
 def train(  # noqa: PLR0913 (keywords, all with a default)
@@ -123,7 +123,7 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
         progress,
         resume_from_last_good=resume_from_last_good,
     )
-    return Run(run.path, config, run.metrics(), run.evaluation(), save_run_figures(run.path))
+    return Run(run.path, config, run.metrics(), run.evaluation())
 
 
 def evaluate(

@@ -176,7 +176,7 @@ class Train(Command):
         """Train, print the last tests, and what to do next."""
         settings = self.settings()
         from headway import api
-        from headway.report import tables
+        from headway.lab import figures, tables
 
         run = api.train(
             self.env,
@@ -190,21 +190,21 @@ class Train(Command):
         )
         last = max((row.iteration for row in run.evaluation), default=0)
         rows = [row for row in run.evaluation if row.iteration == last]
+        drawn = [str(path) for path in figures.save_run_figures(run.path)]
         facts = {
             "run_dir": str(run.path),
             **{name: getattr(run.config, name) for name in ("env", "method", "preset", "seed")},
             "iterations": len(run.metrics),
             "timesteps": run.metrics[-1]["timesteps"],
-            "groups": tables.by_group(rows, run.config),
-            "physics": tables.by_physics(rows, run.config),
-            "figures": [str(path) for path in run.figures],
+            **tables.evaluation_facts(rows, run.config),
+            "figures": drawn,
         }
         title = f"{run.config.env}, {run.config.method} after {len(run.metrics)} iterations"
         again = shlex.join(["headway", *words])
         return self.show(
             facts,
             tables.evaluation(rows, run.config, title),
-            "\n  ".join(["Figures:", *map(str, run.figures)]),
+            "\n  ".join(["Figures:", *drawn]),
             f"Test it again:\n  {shlex.join(['headway', 'evaluate', str(run.path)])}",
             f"The command, which resumes what was interrupted:\n  {again}",
         )
@@ -251,7 +251,7 @@ class Evaluate(_OfRun):
         """Test, print returns per physics, and what planning took."""
         settings = self.changed(self.config())
         from headway import api
-        from headway.report import tables
+        from headway.lab import tables
 
         found = api.evaluate(
             self.run_dir,
@@ -265,8 +265,7 @@ class Evaluate(_OfRun):
             "run_dir": str(self.run_dir),
             "settings": settings,
             "planning": dataclasses.asdict(cost),
-            "groups": tables.by_group(found, config),
-            "physics": tables.by_physics(found, config),
+            **tables.evaluation_facts(found, config),
         }
         took = f"{cost.evaluations_per_step:,.0f} candidates, {cost.flop_per_step / 1e9:.3g} GFLOP"
         if cost.seconds_per_step is not None:
@@ -413,19 +412,18 @@ class _Runs(Command):
         seeds = read_seeds(self.seeds)
         comparison = Comparison(experiment, self.envs, seeds, self.preset, self.out, settings)
         if self.dry_run:
-            from headway.report.comparison.terminal import plan
+            from headway.lab.listing import plan
             from headway.sweeps.cost import make_plan
 
             planned = make_plan(comparison.jobs)
             entries, table = plan(comparison, planned)
             return self.show({**entries, "note": planned.note}, table, planned.note)
-        from headway import compare
-        from headway.report.comparison.terminal import results
+        from headway.lab.comparison import reproduce, results
         from headway.sweeps.board import make_board
         from headway.sweeps.running import Workers
 
         command = shlex.join(["headway", *words])
-        done = compare.reproduce(
+        done = reproduce(
             comparison,
             workers=Workers(self.one_by_one, self.address, self.cpus_per_run, self.gpus_per_run),
             board=make_board(self.quiet),
@@ -437,7 +435,7 @@ class _Runs(Command):
             "experiment": comparison.experiment.name,
             "runs": len(comparison.jobs),
             "failures": {str(path): reason for path, reason in done.failures.items()},
-            "returns": [point._asdict() for point in done.found.final_points],
+            "returns": done.found.last.to_dict("records"),
             "files": [str(path) for path in done.files],
         }
         self.show(
@@ -507,11 +505,9 @@ class List(Command):
 
     def run(self, words):
         """Print a table of names."""
-        from headway.report import tables
-        from headway.report.comparison import terminal
+        from headway.lab import listing
 
-        tables_of = {"envs": tables.envs, "methods": tables.methods, "presets": tables.presets}
-        entries, table = {**tables_of, "experiments": terminal.experiments}[self.what]()
+        entries, table = getattr(listing, self.what)()
         return self.show({self.what: entries}, table)
 
 

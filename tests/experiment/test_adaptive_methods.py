@@ -24,8 +24,6 @@ def test_smoke_run(method, env, tmp_path):
     run = headway.train(env, method=method, preset="smoke", run_dir=tmp_path, settings=TINY)
     assert [m["iteration"] for m in run.metrics] == [0, 1]
     assert np.isfinite([m["fitting"]["loss"] for m in run.metrics]).all()
-    names = ["learning_curve.png", "evaluation.png", "prediction_error.png"]
-    assert [path.name for path in run.figures] == names  # there are no heads to show
     errors = train.RunDir(tmp_path).prediction_errors()
     assert {row["step"] for row in errors} == {1, 2, 3, 4}
     assert all(0 < row["error"] < np.inf for row in errors)

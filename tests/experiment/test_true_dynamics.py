@@ -14,6 +14,7 @@ from headway.experiment.true_dynamics import (
     RobotSimulator,
     make_simulator,
 )
+from headway.lab.figures import save_run_figures
 from headway.planning.controller import env_action
 from headway.planning.returns import RolloutSettings, candidate_returns
 from headway.task import env_names, env_spec
@@ -131,7 +132,7 @@ def test_smoke_run_of_the_simulator_is_only_a_test(env, tmp_path):
     groups = env_spec(env).sim_params.group_names
     assert [row.group for row in run.evaluation] == [g for g in groups for _ in range(2)]
     assert [metrics["timesteps"] for metrics in run.metrics] == [0]
-    assert [path.name for path in run.figures] == ["evaluation.png"]
+    assert [path.name for path in save_run_figures(run.path)] == ["evaluation.png"]
 
 
 def test_a_run_on_the_simulator_can_be_tested_again(tmp_path):

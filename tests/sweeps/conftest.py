@@ -3,7 +3,7 @@
 import fakes
 import pytest
 
-from headway import compare
+from headway.lab import comparison
 from headway.sweeps import running
 
 
@@ -17,4 +17,4 @@ def training(monkeypatch):
 @pytest.fixture
 def without_figures(monkeypatch):
     """Figures take long to draw."""
-    monkeypatch.setattr(compare, "draw_comparison", lambda found: [])
+    monkeypatch.setattr(comparison, "draw", lambda found: [])

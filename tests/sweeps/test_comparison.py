@@ -7,17 +7,11 @@ import re
 import fakes
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from PIL import Image
 
-from headway.compare import reproduce
-from headway.report.comparison.figure import _curves, _dots, arm_styles, has_curves
-from headway.report.comparison.runs import Found, Point, _points, find
-from headway.report.comparison.verdicts import verdicts
-from headway.report.comparison.writing import spread, table_rows, write_table
-from headway.sweeps import running
-from headway.sweeps.experiments import Arm, Experiment, experiment, sweep_experiment
-from headway.sweeps.jobs import Cell, Comparison
+from headway.lab.comparison import find, reproduce, spread, table_rows, verdicts
+from headway.sweeps.experiments import Arm, Experiment, experiment
+from headway.sweeps.jobs import Comparison
 from headway.sweeps.running import Workers
 
 HERE = Workers(one_by_one=True)
@@ -66,71 +60,24 @@ def test_files_stand_beside_each_other_and_hold_what_the_runs_say(training, tmp_
 
 def test_figures_have_ink_and_svg_names_the_arms(training, tmp_path):
     envs = ("pendulum", "hopper", "half-cheetah", "cartpole-swingup")
-    done = reproduce(comparison(tmp_path, envs=envs, seeds=(0, 1)), workers=HERE)
+    reproduce(comparison(tmp_path, envs=envs, seeds=(0, 1)), workers=HERE)
     png, svg = (tmp_path / "fig13-smoke" / f"fig13.{kind}" for kind in ("png", "svg"))
     pixels = np.asarray(Image.open(png).convert("L"))
     assert 0.005 < (pixels < 200).mean() < 0.6
     first = svg.read_bytes()
     assert first.startswith(b"<?xml")
     assert first.count(b"<!-- T-MCL -->") == 1  # matplotlib names drawn texts in comments
-    assert has_curves(done.found)
     svg.unlink()
     reproduce(comparison(tmp_path, envs=envs, seeds=(0, 1)), workers=HERE)
     assert svg.read_bytes() == first
-
-
-def test_one_test_per_run_is_drawn_as_dots(training, tmp_path):
-    asked = comparison(tmp_path, **{"collection.num_iterations": 1})
-    done = reproduce(asked, workers=HERE)
-    assert not has_curves(done.found)
-    assert b"<!-- T-MCL -->" in (tmp_path / "fig13-smoke/fig13.svg").read_bytes()
-
-
-def test_arms_of_different_length_that_are_tested_once_are_dots(training, tmp_path, monkeypatch):
-    def last_only(config, path, progress):
-        fakes.write_run(config, path, keep=tested[config.method])
-
-    tested = {"mcl": 0, "tmcl": 1}
-    monkeypatch.setattr(running, "train_run", last_only)
-    done = reproduce(comparison(tmp_path, seeds=(0,)), workers=HERE)
-    assert [(p.arm, p.iteration) for p in done.found.points] == [("MCL", 0), ("T-MCL", 1)]
-    assert not has_curves(done.found)
-    assert [point.arm for point in done.found.final_points] == ["MCL", "T-MCL"]
-
-
-def test_what_learns_nothing_is_a_level_beside_curves(tmp_path):
-    points = [Point("pendulum", "MCL", 0, 0, 0, -900.0)]
-    points += [Point("pendulum", "T-MCL", 0, i, 20 * i + 20, -500.0 - i) for i in range(3)]
-    found = Found(comparison(tmp_path, seeds=(0,)), [], points, [])
-    assert has_curves(found)
-    axes = Figure().subplots()
-    _curves(axes, found, "pendulum")
-    level, curve = axes.get_lines()
-    assert list(level.get_ydata()) == [-900.0, -900.0]
-    assert list(curve.get_xdata()) == [20, 40, 60]
-
-
-def test_an_episode_that_was_cut_bends_no_curve(tmp_path):
-    points = [
-        Point("pendulum", "T-MCL", seed, i, 20 * i + 20 - 6 * (seed == i == 1), 10.0 * i + 2 * seed)
-        for seed in range(3)
-        for i in range(3)
-    ]
-    axes = Figure().subplots()
-    _curves(axes, Found(comparison(tmp_path), [], points, []), "pendulum")
-    (curve,) = axes.get_lines()
-    assert list(curve.get_xdata()) == [20, 38, 60]
-    assert list(curve.get_ydata()) == [2, 12, 22]
-    edges = axes.collections[0].get_paths()[0].vertices
-    assert {float(y) for x, y in edges if x == 38} == {10.0, 14.0}  # one standard deviation
 
 
 def test_training_curves_show_what_was_collected(training, tmp_path):
     done = reproduce(comparison(tmp_path, "fig9", seeds=(0,)), workers=HERE)
     rows = rows_of(tmp_path / "fig9-smoke/fig9.csv")
     assert {row["group"] for row in rows} == {"collected"}
-    points = done.found.of("pendulum", "T-MCL")
-    assert [(point.iteration, point.value) for point in points] == [(0, 40.0), (1, 41.0)]
+    points = done.found.points.query("label == 'T-MCL'")
+    assert list(zip(points.iteration, points["return"], strict=True)) == [(0, 40.0), (1, 41.0)]
 
 
 def test_few_seeds_and_missing_runs_are_said(training, tmp_path):
@@ -149,8 +96,8 @@ def test_arms_are_compared_over_groups_and_environments_of_both(training, tmp_pa
     training.answers = {0: [fakes.DIVERGED]}
     done = reproduce(comparison(tmp_path, envs=("pendulum", "half-cheetah")), workers=HERE)
     assert [tuple(cell) for cell in done.found.missing] == [("pendulum", "MCL", 0)]
-    returns = {1: 32, 2: 33}
-    assert done.found.run_returns("pendulum", "MCL") == {"low": returns, "high": returns}
+    parts = done.found.parts.query("env == 'pendulum' and label == 'MCL' and group == 'low'")
+    assert dict(zip(parts.seed, parts.return_mean, strict=True)) == {1: 32, 2: 33}
     (line,) = verdicts(done.found)
     assert line.startswith("2 seeds: too few to show that T-MCL and MCL differ")
 
@@ -169,24 +116,13 @@ def test_arms_that_were_not_tested_alike_are_not_compared(training, tmp_path):
 
 def test_physics_count_once_however_many_episodes_they_have(training, tmp_path):
     found = reproduce(comparison(tmp_path, seeds=(0,)), workers=HERE).found
-    place = {"env": "pendulum", "arm": "T-MCL", "seed": 0, "iteration": 1, "group": "low"}
-    rows = [
-        {**place, "sim_params": physics, "return": value}
-        for physics, value in (("length=0.25", 0.0), ("length=0.375", 6.0), ("length=0.375", 8.0))
-    ]
-    one = dataclasses.replace(found, rows=rows)
-    assert one.run_returns("pendulum", "T-MCL") == {"low": {0: 3.5}}
-    cell = Cell("pendulum", "T-MCL", 0)
-    (point,) = _points(found.comparison, cell, [{**row, "timesteps": 20} for row in rows])
-    assert point.value == 3.5
-
-
-def test_settings_are_resolved_once_for_all_lines(training, tmp_path, monkeypatch):
-    found = reproduce(comparison(tmp_path, seeds=(0,)), workers=HERE).found
-    calls, cells = [], Comparison.cells.fget
-    monkeypatch.setattr(Comparison, "cells", property(lambda self: calls.append(1) or cells(self)))
-    write_table(dataclasses.replace(found), "")
-    assert len(calls) == 1
+    rows = found.episodes.query("label == 'T-MCL' and group == 'low' and iteration == 1")
+    rows = rows.iloc[[0, 0, 0]].assign(**{
+        "sim_params": ["length=0.25 mass=1", "length=0.375 mass=1", "length=0.375 mass=1"],
+        "return": [0.0, 6.0, 8.0],
+    })  # fmt: skip
+    (point,) = dataclasses.replace(found, episodes=rows).points["return"]
+    assert point == 3.5
 
 
 def test_another_figure_reuses_the_runs(training, tmp_path):
@@ -194,7 +130,7 @@ def test_another_figure_reuses_the_runs(training, tmp_path):
     before = len(training.calls)
     done = reproduce(comparison(tmp_path, "fig15", seeds=(0,)), workers=HERE)
     assert (before, len(training.calls)) == (2, 2 + 3)
-    assert len(done.found.final_points) == 5
+    assert len(done.found.last) == 5
 
 
 @pytest.mark.usefixtures("training", "without_figures")
@@ -223,10 +159,12 @@ def test_a_comparison_replaces_what_it_contains_and_nothing_else(tmp_path):
     assert make(seeds=(0, 1), envs=("pendulum", "hopper")) != usual
 
 
-def test_nothing_finished_makes_no_figure_but_a_table(tmp_path):
-    found = find(comparison(tmp_path))
-    assert len(found.missing) == 6
-    assert found.points == []
+def test_nothing_finished_makes_no_figure_but_a_table(training, tmp_path):
+    training.answers = {0: [fakes.DIVERGED] * 2}
+    done = reproduce(comparison(tmp_path, seeds=(0,)), workers=HERE)
+    assert [path.suffix for path in done.files] == [".csv", ".md"]
+    assert len(find(comparison(tmp_path, seeds=(0,))).missing) == 2
+    assert "| MCL | 0 | – | – | – | – |" in done.files[-1].read_text()
 
 
 def test_spread_is_over_seeds():
@@ -235,46 +173,13 @@ def test_spread_is_over_seeds():
     assert spread([1.0, 3.0]) == "2.0 ± 1.4"
 
 
-def test_many_arms_can_be_told_apart():
-    for arms in ([Arm(f"arm {i}") for i in range(20)], experiment("comparison").arms):
-        styles = arm_styles(arms)
-        assert len(set(styles.values())) == len(arms)
-
-
-def test_a_method_looks_the_same_in_every_figure():
-    named = [arm_styles(experiment(name).arms) for name in ("comparison", "fig10", "fig13")]
-    for styles in named[1:]:
-        assert styles.items() <= named[0].items()
-    own = sweep_experiment("own", ["pets", "tmcl"], {})
-    assert arm_styles(own.arms).items() <= named[0].items()
-    heads = arm_styles(experiment("fig14").arms)  # of one method
-    assert len(set(heads.values())) == len(heads)
-
-
-def test_dots_stand_in_the_order_of_results_beside_their_scores(training, tmp_path):
+def test_arms_stand_in_the_order_of_results_beside_their_scores(training, tmp_path):
     changed = {"collection.num_iterations": 1, "collection.episode_length": 200}
-    found = reproduce(comparison(tmp_path, **changed), workers=HERE).found
-    axes = Figure().subplots()
-    _dots(axes, found, "pendulum")
-    assert [text.get_text() for text in axes.get_yticklabels()] == ["T-MCL", "MCL"]
-    assert axes.get_xlabel() == "return per episode, unseen physics"
-    scores = [text.get_text() for text in axes.texts]
-    rows = table_rows(found, "pendulum")
-    assert scores == [rows[1][-1], rows[0][-1], "score"]
-    assert "–" not in scores
-    dots = [line for line in axes.get_lines() if len(line.get_xdata()) == 3]
-    assert [line.get_color() for line in dots] == [
-        arm_styles(found.comparison.experiment.arms)[name][0] for name in ("T-MCL", "MCL")
-    ]
-
-
-def test_arms_of_one_method_keep_their_order_and_titles_are_for_readers(training, tmp_path):
-    asked = comparison(tmp_path, "fig12", seeds=(0,), **{"collection.num_iterations": 1})
-    found = reproduce(asked, workers=HERE).found
-    axes = Figure().subplots()
-    _dots(axes, found, "pendulum")
-    names = [text.get_text() for text in axes.get_yticklabels()]
-    assert names == ["with context", "without context"]
-    drawn = (tmp_path / "fig12-smoke/fig12.svg").read_text()
-    assert "<!-- With and without context learning, pendulum -->" in drawn
-    assert "fig12" not in drawn
+    done = reproduce(comparison(tmp_path, **changed), workers=HERE)
+    drawn = (tmp_path / "fig13-smoke/fig13.svg").read_text()
+    rows = table_rows(done.found, "pendulum")
+    texts = ["T-MCL", "MCL", rows[1][-1], rows[0][-1], "score"]
+    assert "–" not in texts
+    assert all(f"<!-- {text.replace('-', '-')} -->" in drawn for text in texts)
+    assert drawn.index("<!-- T-MCL -->") < drawn.index("<!-- MCL -->")
+    assert "<!-- MCL and T-MCL, pendulum -->" in drawn

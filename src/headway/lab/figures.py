@@ -1,0 +1,531 @@
+"""Every figure: one restrained style, safe for colour-blind readers (hues of Okabe and Ito).
+
+Functions that draw on `axes` serve files (`figure`) and the report's page (`panel`) alike. Looks
+are keyword arguments of `Axes.plot` by label. Figures are made without pyplot; the user's own
+Matplotlib settings are put back as soon as one is done.
+"""
+
+import contextlib
+import io
+import re
+import textwrap
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pandas as pd
+from markupsafe import escape
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+
+from headway.experiment.methods import METHODS
+from headway.lab import statistics, tables
+from headway.lab.tables import (
+    COLLECTED,
+    TRAIN,
+    axis_label,
+    distinct,
+    group_label,
+    value_label,
+    varying,
+)
+from headway.training.run import parse_sim_params, write_bytes
+
+INK, FAINT, RULE, GROUND = "#222222", "#7a7a7a", "#e4e4e4", "#f4f4f4"
+_LABELS = {
+    "#0072b2": "#5aaee8",
+    "#d55e00": "#f28a45",
+    "#009e73": "#35c79a",
+    "#b0578d": "#e39cc6",
+    "#c98a00": "#f0b93a",
+    "#3f3f46": "#d4d4d8",
+    "#4aa3d6": "#a5d8f6",
+    "#8a7a00": "#ded35c",
+}
+_HEADS = {
+    "#0173b3": "#3d9be0",
+    "#e69f00": "#e6a817",
+    "#019f74": "#2bb68a",
+    "#cc79a7": "#d893b8",
+    "#56b4e9": "#7cc7f2",
+    "#d65f01": "#e8792e",
+    "#f0e442": "#efe35a",
+    "#999999": "#a3a3a3",
+}
+LABELS, HEADS = tuple(_LABELS), tuple(_HEADS)
+MARKERS, DASHES = "osD^vPX*", ("-", "--", ":")
+_SCALE = matplotlib.colormaps["plasma"]
+_ORDERED = {
+    to_hex(_SCALE(0.08 + 0.72 * place)): to_hex(_SCALE(0.4 + 0.6 * place))
+    for place in np.linspace(0, 1, 12)
+}
+ORDERED = tuple(_ORDERED)
+THEME = {
+    **{"ink": (INK, "#e7e7ea"), "faint": (FAINT, "#9c9ca6"), "rule": (RULE, "#33343b")},
+    **{"axis": ("#9a9a9a", "#60616b"), "paper": ("#ffffff", "#17181c")},
+    "ground": (GROUND, "#26272e"),
+    **{f"s{i}": pair for i, pair in enumerate(_LABELS.items())},
+    **{f"h{i}": pair for i, pair in enumerate(_HEADS.items())},
+    **{f"p{i}": pair for i, pair in enumerate(_ORDERED.items())},
+}
+"""Variables of the page's style sheet: a colour in light and in dark."""
+
+_STYLE: dict[Any, Any] = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 9.0,
+    "text.color": INK,
+    "text.usetex": False,
+    "text.parse_math": False,  # a dollar is a dollar
+    "axes.facecolor": "none",
+    "axes.edgecolor": "#9a9a9a",
+    "axes.labelcolor": INK,
+    "axes.labelsize": 9.0,
+    "axes.linewidth": 0.8,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 8.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.grid.axis": "y",
+    "axes.axisbelow": True,
+    "axes.unicode_minus": True,
+    "grid.color": RULE,
+    "grid.linewidth": 0.8,
+    "xtick.color": FAINT,
+    "ytick.color": FAINT,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.labelsize": 8.5,
+    "ytick.labelsize": 8.5,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "lines.linewidth": 1.7,
+    "lines.solid_capstyle": "round",
+    "figure.facecolor": "white",
+    "svg.hashsalt": "headway",
+}
+
+Looks = Mapping[str, Mapping[str, Any]]
+
+
+@contextlib.contextmanager
+def figure(
+    path: Path, *, title: str, caption: str, size: tuple[float, float], svg: bool = False
+) -> Iterator[Figure]:
+    """Make a figure, hand it out to be drawn on, and write it.
+
+    Args:
+        path: The PNG file; its directory is created.
+        title: One line that says what is seen.
+        caption: What the marks are and where the numbers come from; wrapped to the width.
+        size: Width and height of what is drawn in inches; title, legend and caption come on top.
+        svg: Whether to write an SVG file beside the PNG as well.
+    """
+    with matplotlib.rc_context(_STYLE):
+        drawing = Figure(figsize=size, layout="constrained")
+        canvas = FigureCanvasAgg(drawing)
+        yield drawing
+        # Around the axes, in inches from the figure's box: the file is cut to what it holds.
+        canvas.draw()
+        above = 0.14 + sum(box.get_window_extent().height / drawing.dpi for box in drawing.legends)
+        heading = {"va": "bottom", "fontsize": 11, "fontweight": "bold"}
+        drawing.text(0.01, 1 + above / size[1], title, **heading)
+        lines = textwrap.fill(caption, int(size[0] / 0.058))
+        small = {"va": "top", "fontsize": 7.5, "color": FAINT, "linespacing": 1.35}
+        drawing.text(0.01, -0.1 / size[1], lines, **small)
+        for kind in ("png", *["svg"] * svg):
+            image = io.BytesIO()
+            look: dict[str, Any] = {"dpi": 160} if kind == "png" else {"metadata": {"Date": None}}
+            drawing.savefig(image, format=kind, bbox_inches="tight", pad_inches=0.16, **look)
+            write_bytes(path.with_suffix(f".{kind}"), image.getvalue())
+
+
+def legend(drawing: Figure, looks: Looks) -> None:
+    """Explain looks above the axes, in as many columns as the width has room for."""
+    handles = [
+        Patch(color=look["color"], label=label)
+        if look.get("marker") == "patch"
+        else Line2D([], [], label=label, **{"markersize": 4, **look})
+        for label, look in looks.items()
+    ]
+    needed = 0.62 + 0.068 * max(map(len, looks))
+    drawing.legend(
+        handles=handles,
+        loc="lower left",
+        bbox_to_anchor=(0.005, 1.0),
+        borderaxespad=0.3,
+        borderpad=0,
+        ncols=min(max(int(drawing.get_figwidth() / needed), 1), len(handles)),
+    ).set_in_layout(False)
+
+
+def panel(
+    draw: Callable[[Axes], None],
+    *,
+    name: str,
+    label: str,
+    size: tuple[float, float] = (3.5, 2.5),
+) -> str:
+    """Draw a figure of one axes as an SVG element in the colours of the page's theme.
+
+    Text stays text. An artist whose `gid` is `series-N` gets that class, so that it can be hidden.
+
+    Args:
+        draw: Draws on the axes it is given.
+        name: Unique on the page; every identifier inside begins with it.
+        label: What is seen, for those who cannot see it.
+        size: Width and height in inches: small enough to be read on a phone.
+    """
+    small = {"font.size": 8.5, "axes.labelsize": 8.5, "xtick.labelsize": 8, "ytick.labelsize": 8}
+    inline = {"svg.fonttype": "none", "savefig.facecolor": "none", "svg.hashsalt": name}
+    with matplotlib.rc_context({**_STYLE, **small, **inline}):
+        drawing = Figure(figsize=size, layout="constrained")
+        draw(drawing.subplots())
+        written = io.StringIO()
+        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        drawing.savefig(written, format="svg", metadata=nothing)
+    svg = re.sub(r"<(metadata|style).*?</\1>", "", written.getvalue(), flags=re.DOTALL)
+    svg = svg[svg.index("<svg") :]
+    box = re.search(r'viewBox="([-\d. ]+)"', svg)
+    svg = svg[svg.index(">") + 1 :]
+    variables = {light: f"var(--{variable})" for variable, (light, _) in THEME.items()}
+    svg = re.sub(
+        r"(fill|stroke): (#[0-9a-f]{6})\b",
+        lambda found: f"{found[1]}: {variables.get(found[2], found[2])}",
+        svg,
+    )
+    svg = re.sub(r'<g id="series-(\d+)">', r'<g class="series-\1">', svg)
+    svg = re.sub(r'(<\w+) id="', rf'\1 id="{name}-', svg)
+    svg = re.sub(r' xlink:href="#', f' href="#{name}-', svg).replace("url(#", f"url(#{name}-")
+    svg = re.sub(r" font-family: [^;\"]*;", "", svg)
+    svg = re.sub(r'(?<= d=")[^"]*', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), svg)
+    return (
+        f'<svg viewBox="{box[1] if box else ""}" role="img" aria-label="{escape(label)}">'
+        + re.sub(r"\s*\n\s*", "\n", svg).strip()
+    )
+
+
+def look(index: int) -> dict[str, Any]:
+    """Colour, marker and dashes of the label at a place of the legend."""
+    return {
+        "color": LABELS[index % len(LABELS)],
+        "marker": MARKERS[index % len(MARKERS)],
+        "linestyle": DASHES[index // len(LABELS) % len(DASHES)],
+    }
+
+
+def are_methods(arms: Sequence[Any]) -> bool:
+    """Whether every arm is another method, and not a setting of one."""
+    return len({arm.method for arm in arms}) == len(arms)
+
+
+def arm_looks(arms: Sequence[Any]) -> dict[str, dict[str, Any]]:
+    """Looks of an experiment's arms; where arms are methods, a method has one look everywhere."""
+    main = ("tmcl", "mcl", "pets", "mh-pets", "pets-cadm", "grbal", "rebal", "ria")
+    order = [*main, *(name for name in METHODS if name not in main)]
+    methods = are_methods(arms)
+    return {
+        arm.label: look(order.index(arm.method) if methods else i) for i, arm in enumerate(arms)
+    }
+
+
+def group_looks(groups: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Looks of groups of physics: blue for training, warm and green ones for unseen groups."""
+    unseen = [group for group in groups if group not in (TRAIN, COLLECTED)]
+    looks = {group: look(1 + i) for i, group in enumerate(unseen)}
+    looks[TRAIN] = {**look(0), "linestyle": "--", "markerfacecolor": "white"}
+    looks[COLLECTED] = look(0)
+    return {group: looks[group] for group in groups}
+
+
+def numbers(axes: Axes, *, x: str = "", y: str = "") -> None:
+    """Name the axes, with few ticks and grouped thousands on those that have numbers."""
+    for axis, name in ((axes.xaxis, x), (axes.yaxis, y)):
+        if name:
+            axis.set_major_locator(MaxNLocator(5))
+            axis.set_major_formatter(lambda value, _: f"{value:,.10g}".replace("-", "−"))
+            axis.set_label_text(name)
+
+
+def curves(axes: Axes, table: pd.DataFrame, looks: Looks) -> None:
+    """Draw return over environment steps.
+
+    Lines are means over the finished runs, or over all where none is finished. The band is the
+    95 % interval of the mean; with fewer than three runs each has a thin line. Unfinished ones
+    are thin and dotted. What learns nothing is a level.
+
+    Args:
+        axes: Where to draw.
+        table: label, run, iteration, timesteps, return, finished.
+        looks: Looks by label.
+    """
+    for label, own in table.groupby("label", sort=False):
+        style = {"markersize": 4, **looks[str(label)]}
+        thin = {**style, "linewidth": 0.8, "alpha": 0.7, "marker": "", "linestyle": "-"}
+        done = own[own.finished] if own.finished.any() else own
+        returns = done.pivot(index="run", columns="iteration", values="return").dropna(axis=1)
+        if returns.empty:
+            continue
+        steps = done.groupby("iteration").timesteps.mean()[returns.columns].to_numpy()
+        middle = returns.mean().to_numpy()
+        if not steps.any():
+            level = {name: style[name] for name in ("color", "linestyle")}
+            axes.axhline(middle[0], linewidth=1.2, gid=style.get("gid"), **level)
+            continue
+        columns = returns.to_numpy().T[:, :, None]
+        if len(returns) >= statistics.MIN_RUNS:
+            ends = [statistics.estimate([c], statistics.mean).interval for c in columns]
+            band = axes.fill_between(steps, *np.array(ends).T, color=style["color"], alpha=0.14)
+            band.set(linewidth=0, gid=style.get("gid"))
+        elif len(returns) > 1:
+            axes.plot(steps, columns[:, :, 0], **thin)
+        if own.finished.any():
+            for _, run in own[~own.finished].groupby("run"):
+                axes.plot(run.timesteps, run["return"], **{**thin, "linestyle": ":"})
+        axes.plot(steps, middle, **style)
+    axes.set_xlim(left=0)
+    numbers(axes, x="environment steps collected", y="return per episode")
+
+
+def dots(
+    axes: Axes, table: pd.DataFrame, looks: Looks, name: str, notes: Mapping[str, str] | None = None
+) -> None:
+    """Draw a line per label: a dot per run, a bar at their mean, its 95 % interval.
+
+    Args:
+        axes: Where to draw.
+        table: label, value.
+        looks: Looks by label, from top to bottom.
+        name: What the values are.
+        notes: A text beside each line.
+    """
+    place = axes.get_yaxis_transform()
+    for row, (label, style) in enumerate(looks.items()):
+        values = table.loc[table.label == label, "value"].to_numpy()
+        shared = {"color": style["color"], "gid": style.get("gid")}
+        if not len(values):
+            axes.text(0.5, row, "no run", va="center", color=FAINT, transform=place)
+            continue
+        ends = statistics.estimate([values[:, None]], statistics.mean).interval
+        if ends:
+            axes.plot(ends, [row, row], linewidth=1.2, alpha=0.7, **shared)
+        axes.plot(values, [row] * len(values), "o", alpha=0.6, markersize=5, **shared)
+        bar = {**shared, "color": INK, "linewidth": 1.6}
+        axes.plot([values.mean()] * 2, [row - 0.3, row + 0.3], **bar)
+        axes.text(1.02, row, (notes or {}).get(label, ""), va="center_baseline", transform=place)
+    if notes and set(notes.values()) != {"–"}:
+        axes.text(1.02, -0.75, "score", va="center", color=FAINT, transform=place)
+    axes.set_yticks(range(len(looks)), [textwrap.shorten(label, 34) for label in looks])
+    axes.set_ylim(len(looks) - 0.5, -0.5)
+    axes.tick_params(axis="y", length=0)
+    axes.grid(visible=False, axis="y")
+    axes.grid(visible=True, axis="x")
+    numbers(axes, x=name)
+
+
+def by_physics(
+    axes: Axes, table: pd.DataFrame, looks: Looks, name: str, *, joined: bool = False
+) -> None:
+    """Draw values over physics in ascending order; unseen ones stand on a grey ground.
+
+    Args:
+        axes: Where to draw.
+        table: label, group, sim_params, value.
+        looks: Looks by label.
+        name: What the values are.
+        joined: Draw a line through the means of each label instead of every value.
+    """
+    by_text = {text: parse_sim_params(text) for text in table.sim_params.unique()}
+    physics = distinct(by_text.values())
+    places = table.sim_params.map({text: physics.index(p) for text, p in by_text.items()})
+    for place in places[table.group != TRAIN].unique():
+        axes.axvspan(place - 0.5, place + 0.5, color=GROUND, zorder=0, linewidth=0)
+    rng = np.random.default_rng(0)
+    for label, style in looks.items():
+        own = table.label == label
+        x, y = places[own].to_numpy(), table.value[own].to_numpy()
+        means = pd.Series(y).groupby(x).mean()
+        if joined:
+            axes.plot(means.index, means, **{"markersize": 4.5, **style})
+            continue
+        axes.scatter(x + rng.uniform(-0.13, 0.13, len(x)), y, s=18, color=style["color"],
+                     alpha=0.55, linewidths=0)  # fmt: skip
+        for place, mean in means.items():
+            axes.plot([place - 0.3, place + 0.3], [mean] * 2, color=style["color"], linewidth=2.6)
+    names = varying(physics)
+    axes.set_xlim(-0.5, len(physics) - 0.5)
+    numbers(axes, y=name)
+    axes.set_xticks(range(len(physics)), [value_label(p, names) for p in physics])
+    axes.tick_params(axis="x", length=0)
+    axes.set_xlabel(axis_label(names))
+
+
+def error_lines(axes: Axes, table: pd.DataFrame, looks: Looks) -> None:
+    """Draw the error of imagined observations over the steps imagined.
+
+    Lines are means over runs, bands reach from the best to the worst run.
+
+    Args:
+        axes: Where to draw.
+        table: label, run, step, error.
+        looks: Looks by label.
+    """
+    table = table[np.isfinite(table.error)]
+    for label, own in table.groupby("label", sort=False):
+        style, errors = looks[str(label)], own.groupby("step").error
+        if own["run"].nunique() > 1:
+            band = axes.fill_between(
+                errors.mean().index, errors.min(), errors.max(), color=style["color"], alpha=0.14
+            )
+            band.set(linewidth=0, gid=style.get("gid"))
+        axes.plot(errors.mean(), **{"markersize": 3, "markevery": 2, **style})
+    axes.axhline(1.0, color=FAINT, linewidth=1, linestyle=":", zorder=1)
+    highest = table.error.max()
+    numbers(axes, x="imagined steps ahead", y="error (standard deviations)")
+    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+    if highest > 10:
+        axes.set_yscale("log")
+    else:
+        axes.set_ylim(0, max(1.1, 1.05 * highest))
+
+
+def head_shares(axes: Axes, table: pd.DataFrame) -> None:
+    """Draw the share of segments that each head explains best: a bar per physics and member.
+
+    Args:
+        axes: Where to draw; wide enough for all members side by side.
+        table: member, head, sim_params, share.
+    """
+    physics = distinct(map(parse_sim_params, table.sim_params.unique()))
+    shares = table.assign(share=table.share.fillna(0.0).clip(0, 1)).pivot_table(
+        index=["member", "sim_params"], columns="head", values="share", aggfunc="sum"
+    )
+    members = shares.index.get_level_values("member").unique()
+    for (member, text), heads in shares.iterrows():  # type: ignore[misc]
+        left = 1.12 * members.get_loc(member)
+        row = physics.index(parse_sim_params(text))
+        for head, share in heads.fillna(0.0).items():
+            color = HEADS[int(str(head)) % len(HEADS)]
+            axes.barh(row, share, 0.82, left, color=color, linewidth=0)
+            left += share
+    names = varying(physics)
+    axes.set_yticks(range(len(physics)), [value_label(p, names) for p in physics])
+    axes.set_ylim(len(physics) - 0.5, -0.5)
+    axes.set_xticks([1.12 * i + 0.5 for i in range(len(members))], list(map(str, members)))
+    axes.set_xlim(0, 1.12 * len(members) - 0.12)
+    axes.tick_params(length=0)
+    axes.grid(visible=False)
+    axes.spines[:].set_visible(False)
+    axes.set_xlabel("member")
+    axes.set_ylabel(axis_label(names))
+
+
+def head_looks(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    """Looks of heads, for a legend."""
+    heads = sorted(table["head"].unique())
+    return {f"head {h}": {"color": HEADS[h % len(HEADS)], "marker": "patch"} for h in heads}
+
+
+def _learning_curve(axes: Axes, table: pd.DataFrame, looks: Looks) -> None:
+    """Draw one run's mean return by group, with one standard deviation over episodes."""
+    for group, own in table.groupby("group", sort=False):
+        style = {"markersize": 4, **looks[str(group)]}
+        middle, spread = own["return"], own["std"]
+        if group == COLLECTED:
+            ends = (middle - spread, middle + spread)
+            axes.fill_between(own.timesteps, *ends, color=style["color"], alpha=0.14, linewidth=0)
+            spread = None
+        axes.errorbar(own.timesteps, middle, yerr=spread, elinewidth=1, **style)
+    axes.set_xlim(left=0)
+    numbers(axes, x="environment steps collected", y="return per episode (sum of rewards)")
+
+
+def save_run_figures(run_dir: str | Path) -> list[Path]:
+    """Draw every figure that the tables of a run allow, from these files alone.
+
+    Args:
+        run_dir: A run directory; the PNG files go into its `figures/`.
+
+    Returns:
+        The files written, in reading order. A figure whose numbers are missing is left out.
+
+    Raises:
+        RunError: There is no run that can be read.
+    """
+    found = tables.read_runs([run_dir])
+    (run,) = found.runs.itertuples()
+    folder, made = Path(run_dir) / "figures", []
+    source = f"{run.env}, {run.method}, preset {run.preset}, seed {run.seed}"
+
+    @contextlib.contextmanager
+    def drawn(name: str, title: str, caption: str, size: tuple[float, float]) -> Iterator[Figure]:
+        made.append(folder / f"{name}.png")
+        text = f"{source}{caption}"
+        with figure(made[-1], title=title, caption=text, size=size) as drawing:
+            yield drawing
+
+    last = found.episodes[found.episodes.iteration == found.episodes.iteration.max()]
+    counts = last.groupby("group", sort=False).size()
+    tested = "; ".join(f"{count} test episodes of {group}" for group, count in counts.items())
+    if counts.nunique() == 1:
+        tested = f"{counts.iloc[0]} test episodes per group"
+    learned = found.curves[found.curves.timesteps > 0]
+    if len(learned):
+        caption = (
+            f". Mean over episodes, band and bars ± 1 standard deviation over episodes; {tested}."
+            " The first iteration acts at random; tests follow the fit."
+        )
+        with drawn("learning_curve", "Return while learning", caption, (6.6, 3.3)) as drawing:
+            looks = group_looks(list(learned.group.unique()))
+            _learning_curve(drawing.subplots(), learned, looks)
+            legend(drawing, {group_label(group): style for group, style in looks.items()})
+    if len(last):
+        panels = {"return per episode": last["return"]}
+        if last.score.notna().any():
+            panels["score (0 random, 1 true dynamics)"] = last.score
+        caption = (
+            f", iteration {last.iteration.max() + 1}. Dots are episodes, bars means; {tested}."
+        )
+        size = (6.6 if len(panels) == 1 else 9.2, 3.1)
+        with drawn("evaluation", "Return on training and unseen physics", caption, size) as drawing:
+            looks = group_looks(list(counts.index))
+            for i, (name, values) in enumerate(panels.items()):
+                axes = drawing.add_subplot(1, len(panels), i + 1)
+                shown = last.assign(label=last.group, value=values).dropna(subset="value")
+                by_physics(axes, shown, looks, name)
+                for level in (0.0, 1.0) if i else ():
+                    axes.axhline(level, color=FAINT, linewidth=1, linestyle=":")
+            marks = {"linestyle": "", "marker": "o"}
+            legend(drawing, {group_label(g): {**style, **marks} for g, style in looks.items()})
+    if found.assignments["head"].nunique() > 1:
+        caption = (
+            f", iteration {found.assignments.iteration.max() + 1}. Share of the collected segments"
+            " of each physics whose oracle loss is lowest under each head. Head numbers are"
+            " arbitrary: head 0 of one member has nothing to do with head 0 of another."
+        )
+        rows = found.assignments.sim_params.nunique()
+        size = (max(1.3 * found.assignments.member.nunique() + 0.6, 5.6), 0.9 + 0.3 * rows)
+        with drawn("head_shares", "Best head of each physics", caption, size) as drawing:
+            head_shares(drawing.subplots(), found.assignments)
+            legend(drawing, head_looks(found.assignments))
+    if len(found.errors):
+        caption = (
+            f", iteration {found.errors.iteration.max() + 1}. Root mean squared error of imagined"
+            " observations over moments of test episodes, members and dimensions, in units of each"
+            " dimension's standard deviation. At 1, predicting the mean would do as well."
+        )
+        title = "Prediction error by imagined step"
+        with drawn("prediction_error", title, caption, (6.6, 3.1)) as drawing:
+            looks = group_looks(list(found.errors.group.unique()))
+            error_lines(drawing.subplots(), found.errors.assign(label=found.errors.group), looks)
+            legend(drawing, {group_label(group): style for group, style in looks.items()})
+    return made

@@ -1,1 +1,0 @@
-"""What an experiment or a sweep found: figure, raw numbers and table beside each other."""

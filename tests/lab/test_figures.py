@@ -1,0 +1,123 @@
+"""The figures of a run."""
+
+import json
+
+import matplotlib
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+from headway.errors import RunError
+from headway.experiment.methods import METHODS
+from headway.lab import figures
+from headway.lab.figures import save_run_figures
+from headway.sweeps.experiments import Arm, experiment, sweep_experiment
+
+ALL = ["learning_curve.png", "evaluation.png", "head_shares.png", "prediction_error.png"]
+
+
+def test_every_figure_is_drawn_and_settings_of_the_user_stay(run_dir):
+    before = dict(matplotlib.rcParams)
+    paths = save_run_figures(run_dir)
+    assert [path.name for path in paths] == ALL
+    for path in paths:
+        assert path.parent == run_dir / "figures"
+        pixels = np.asarray(Image.open(path).convert("L"))
+        assert pixels.shape[0] > 400
+        assert 0.005 < (pixels < 200).mean() < 0.6
+    assert dict(matplotlib.rcParams) == before
+
+
+@pytest.mark.parametrize(
+    ("missing", "figure"),
+    [
+        ("metrics.jsonl", "learning_curve.png"),
+        ("evaluation.csv", "evaluation.png"),
+        ("assignments.csv", "head_shares.png"),
+        ("prediction_error.csv", "prediction_error.png"),
+    ],
+)
+def test_a_missing_file_leaves_its_figure_out(run_dir, missing, figure):
+    (run_dir / missing).unlink()
+    names = [path.name for path in save_run_figures(run_dir)]
+    assert names == [name for name in ALL if name != figure]
+
+
+def test_one_iteration_one_head_diverged_predictions(tmp_path, write_run):
+    path = write_run(tmp_path / "run", iterations=1, heads=1)
+    table = path / "prediction_error.csv"
+    table.write_text(table.read_text() + "0,low,21,1e6\n0,low,22,nan\n0,far,1,inf\n")
+    lines = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+    for line in lines:
+        line.pop("evaluation")
+    (path / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    names = [figure.name for figure in save_run_figures(path)]
+    assert names == [name for name in ALL if name != "head_shares.png"]
+
+
+def test_no_figures_of_what_is_no_run(tmp_path):
+    with pytest.raises(RunError, match="not a directory"):
+        save_run_figures(tmp_path / "nothing")
+
+
+def curve_of(values, finished=True):
+    """Returns by seed and iteration, as `figures.curves` takes them."""
+    return pd.DataFrame(
+        [
+            {"label": "A", "run": str(seed), "iteration": i, "timesteps": 20 * i + 20 * (i < 9),
+             "return": value, "finished": finished}
+            for seed, returns in enumerate(values)
+            for i, value in enumerate(returns)
+        ]
+    )  # fmt: skip
+
+
+def drawn_curves(table):
+    axes = Figure().subplots()
+    figures.curves(axes, table, {"A": figures.look(0)})
+    return axes
+
+
+def test_curves_have_a_band_from_three_seeds_on():
+    two = drawn_curves(curve_of([[0, 10], [2, 12]]))
+    assert not two.collections
+    assert len(two.get_lines()) == 3  # a thin line per seed
+    three = drawn_curves(curve_of([[0, 10], [2, 12], [4, 14]]))
+    assert len(three.collections) == 1
+    (line,) = three.get_lines()
+    assert list(line.get_ydata()) == [2, 12]
+
+
+def test_unfinished_runs_are_no_part_of_the_mean():
+    table = pd.concat([curve_of([[0, 10]]), curve_of([[99]], finished=False).assign(run="x")])
+    lines = drawn_curves(table).get_lines()
+    assert [list(line.get_ydata()) for line in lines] == [[99], [0, 10]]
+
+
+def test_what_learns_nothing_is_a_level():
+    axes = drawn_curves(curve_of([[5.0]]).assign(timesteps=0))
+    (line,) = axes.get_lines()
+    assert list(line.get_ydata()) == [5.0, 5.0]
+
+
+def test_dots_mark_every_run_and_no_interval_of_two():
+    for values, marks in (([1.0, 2.0], 2), ([1.0, 2.0, 3.0], 3)):
+        axes = Figure().subplots()
+        table = pd.DataFrame({"label": "A", "value": values})
+        figures.dots(axes, table, {"A": figures.look(0), "B": figures.look(1)}, "score")
+        assert len(axes.get_lines()) == marks  # an interval, dots, their mean
+        assert [text.get_text() for text in axes.get_yticklabels()] == ["A", "B"]
+
+
+def test_a_method_looks_the_same_in_every_figure_and_arms_differ():
+    named = [figures.arm_looks(experiment(name).arms) for name in ("comparison", "fig10", "fig13")]
+    for looks in named[1:]:
+        assert looks.items() <= named[0].items()
+    assert figures.arm_looks(sweep_experiment("own", ["pets", "tmcl"], {}).arms).items() <= (
+        named[0].items()
+    )
+    for arms in (experiment("comparison").arms, [Arm(f"arm {i}") for i in range(len(METHODS))]):
+        looks = figures.arm_looks(arms).values()
+        assert len({tuple(look.values()) for look in looks}) == len(arms)

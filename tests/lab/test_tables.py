@@ -1,0 +1,175 @@
+"""The table of runs: numbers against hand-made ones, labels, scores, damage."""
+
+import csv
+import io
+import json
+import shutil
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from headway.errors import RunError
+from headway.experiment.methods import make_config
+from headway.lab.tables import (
+    axis_label,
+    by_group,
+    by_physics,
+    distinct,
+    episode_table,
+    evaluation,
+    facts,
+    full_label,
+    read_runs,
+    varying,
+)
+from headway.training.run import EpisodeRow
+
+HOSTILE = '<script>alert("1")</script>&amp;$x_{2}$'
+
+
+def mean_of(path, length, iteration=4):
+    """The mean return of one physics after one iteration, by other means."""
+    with (path / "evaluation.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["iteration"] == str(iteration)]
+    return np.mean(
+        [float(row["return"]) for row in rows if row["sim_params"] == f"length={length:g} mass=1"]
+    )
+
+
+def test_numbers_are_those_of_the_files(folder):
+    runs = read_runs([folder])
+    parts = by_physics(runs.final).set_index(["label", "seed", "sim_params"])
+    one = parts.loc[("pets", 1, "length=0.5 mass=1")]
+    assert one.return_mean == pytest.approx(mean_of(folder / "pets-1", 0.5))
+    low, high = (
+        np.mean([mean_of(folder / f"{name}-{seed}", 0.5) for seed in range(3)])
+        for name in ("random", "true-dynamics")
+    )
+    assert one.score == pytest.approx((one.return_mean - low) / (high - low))
+    group = by_group(runs.final).set_index(["label", "seed", "group"]).loc[("pets", 1, "low")]
+    means = [mean_of(folder / "pets-1", length) for length in (0.25, 0.375)]
+    assert group.return_mean == pytest.approx(np.mean(means))
+    assert runs.runs.set_index("run").loc[str(folder / "pets-1"), "collect"] == 5
+    assert not runs.notes
+
+
+def test_the_projects_references_serve_where_no_run_is_one(run_dir):
+    parts = by_physics(read_runs([run_dir]).final).set_index("sim_params")
+    one = parts.loc["length=0.5 mass=1"]
+    assert one.score == pytest.approx((one.return_mean + 1501) / (-126 + 1501))
+
+
+def test_references_that_planned_in_several_ways_normalise_nothing(tmp_path, write_run):
+    for horizon in (10, 30):
+        planner = {"horizon": horizon}
+        path = tmp_path / f"ceiling-{horizon}"
+        write_run(path, method="true-dynamics", env="own", planner=planner)
+    write_run(tmp_path / "random", method="random", env="own", lift=-900)
+    write_run(tmp_path / "tmcl", env="own")
+    runs = read_runs([tmp_path])
+    assert runs.episodes.score.isna().all()
+    compared = runs.runs[~runs.runs.is_reference]
+    assert list(compared.label) == [
+        "tmcl", "true-dynamics, horizon 10", "true-dynamics, horizon 30"
+    ]  # fmt: skip
+
+
+def test_variants_are_named_by_what_differs(tmp_path, write_run):
+    write_run(tmp_path / "a", planner={"horizon": 10, "head_selection": "adaptive"})
+    write_run(tmp_path / "b", planner={"horizon": 20, "head_selection": "adaptive"})
+    write_run(tmp_path / "c", method="pets", planner={"horizon": 20})
+    runs = read_runs([tmp_path]).runs
+    assert set(runs.label) == {"tmcl, horizon 10", "tmcl, horizon 20", "pets"}
+
+
+def test_a_run_that_stands_twice_counts_once(run_dir, tmp_path):
+    shutil.copytree(run_dir, tmp_path / "copy")
+    runs = read_runs([run_dir, tmp_path, run_dir])
+    assert len(runs.runs) == 1
+    assert [text for _, text in runs.notes] == [
+        f"left out: same settings and seed as {tmp_path / 'copy'}."
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "lost"),
+    [
+        ("config.json", "left out"),
+        ("metrics.jsonl", "no curve, times or final result"),
+        ("evaluation.csv", "no final result"),
+        ("assignments.csv", "no head shares"),
+        ("prediction_error.csv", "no prediction errors"),
+    ],
+)
+@pytest.mark.parametrize("content", [b"\xff\x00 no\n", b"[1,2]\n", b'iteration,group\nx,"y\n'])
+def test_damage_costs_one_line(folder, name, lost, content):
+    (folder / "tmcl-1" / name).write_bytes(content)
+    runs = read_runs([folder])
+    own = [text for run, text in runs.notes if run == str(folder / "tmcl-1")]
+    assert own[0].startswith(lost)
+    assert all("\n" not in text for text in own)
+    assert len(runs.runs) == 12 - (name == "config.json")
+
+
+def test_unfinished_runs_have_curves_but_no_final_results(folder):
+    path = folder / "tmcl-2/metrics.jsonl"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:3]))
+    runs = read_runs([folder])
+    assert runs.notes[0][1].startswith("3 of 5 iterations are finished")
+    assert str(folder / "tmcl-2") not in set(runs.final["run"])
+    assert str(folder / "tmcl-2") in set(runs.curves["run"])
+
+
+def test_nothing_to_read_is_an_error(tmp_path):
+    with pytest.raises(RunError, match="not a directory"):
+        read_runs([tmp_path / "nothing"])
+    with pytest.raises(RunError, match="holds no run"):
+        read_runs([tmp_path])
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(RunError, match="none of 1 runs can be read"):
+        read_runs([tmp_path])
+
+
+def test_settings_of_an_older_shape_are_read(run_dir):
+    config = {"env": "pendulum", "method": "gone", "seed": 3}
+    (run_dir / "config.json").write_text(json.dumps(config))
+    runs = read_runs([run_dir])
+    assert list(runs.runs.label) == ["gone"]
+    assert len(runs.final) == 24
+
+
+def test_a_group_score_counts_each_physics_once():
+    def row(length, value):
+        physics = {"length": length, "mass": 1.0}
+        return EpisodeRow("tmcl", "pendulum", 0, 0, "train", physics, 0, value, 200)
+
+    config = make_config("pendulum")
+    rows = [row(0.5, -126.0), row(1.0, -1143.0), row(1.0, -1143.0)]
+    assert [part["episodes"] for part in facts(by_physics(episode_table(rows, config)))] == [1, 2]
+    (group,) = facts(by_group(episode_table(rows, config)))
+    assert group["score"] == pytest.approx(0.5)
+    assert (group["episodes"], group["return_mean"]) == (3, (-126 - 1143) / 2)
+    assert group["return_std"] == pytest.approx((1143 - 126) / 2)
+    rows.append(row(9.0, 0.0))
+    assert facts(by_group(episode_table(rows, config)))[0]["score"] is None
+
+
+def test_brackets_in_names_are_no_markup():
+    physics = {"length": 0.5, "mass": 1.0}
+    rows = [EpisodeRow("tmcl", "pendulum", 0, 0, "[/x]", physics, 0, -126.0, 200)]
+    table = evaluation(rows, make_config("pendulum"), "runs/[/x][bold]")
+    console = Console(width=120, file=io.StringIO(), record=True)
+    console.print(table)
+    text = console.export_text()
+    assert "runs/[/x][bold]" in text
+    assert "unseen: [/x]" in text
+
+
+def test_physics_are_written_for_readers():
+    physics = [{"length": 1.5, "mass": 1.0}, {"length": 0.5, "mass": 1.0}]
+    assert distinct(physics)[0]["length"] == 0.5
+    assert varying(physics) == ["length"]
+    assert varying(physics[:1]) == ["length", "mass"]
+    assert axis_label(["length", "mass_scale"]) == "length (m), mass scale"
+    assert full_label(physics[0], ["length"]) == "length 1.5 m"
