@@ -6,10 +6,10 @@ import jax
 import pytest
 from workloads import make_fit, update_flop
 
-from headway.config import FittingConfig, ModelConfig, Precision
+from headway.config import FittingConfig, MultiHeadedConfig, Precision
 from headway.models.fitting import fit_epoch
 
-MODEL = ModelConfig()
+MODEL = MultiHeadedConfig()
 
 
 @pytest.mark.parametrize("precision", typing.get_args(Precision))

@@ -7,18 +7,22 @@ from typing import Any
 import jax
 from workloads import EPISODE_LENGTH, make_agent, make_fit, make_trajectories
 
-from headway.config import FittingConfig, ModelConfig, PlannerConfig
+from headway.config import CEMConfig, FittingConfig, MultiHeadedConfig, PlannerConfig
 from headway.data import Episodes, Samples
 from headway.models.compilation import jit_networks
 from headway.models.dynamics import Statistics
 from headway.models.fitting import assign_segments, fit_epoch, make_data
 from headway.task import env_spec
 
-MODEL = ModelConfig(
+MODEL = MultiHeadedConfig(
     num_members=2, hidden_sizes=(64, 64), context_hidden_sizes=(32,), backward_net=False
 )
 PLANNER = PlannerConfig(
-    horizon=10, num_candidates=100, num_elites=25, num_iterations=2, num_particles=4
+    horizon=10,
+    num_candidates=100,
+    optimizer=CEMConfig(num_elites=25),
+    num_iterations=2,
+    num_particles=4,
 )
 FITTING = FittingConfig(future_length=1)
 NUM_ENVS = 8
@@ -37,7 +41,7 @@ class Axis:
     work: Callable[[int], Work]
 
 
-def plan(num_envs: int = NUM_ENVS, model: ModelConfig = MODEL, **planner: Any) -> Work:
+def plan(num_envs: int = NUM_ENVS, model: MultiHeadedConfig = MODEL, **planner: Any) -> Work:
     """One plan of the small planner with some settings changed."""
     settings = dataclasses.replace(PLANNER, **planner)
     agent, state, obs = make_agent(num_envs, model, settings)

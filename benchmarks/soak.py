@@ -17,10 +17,10 @@ import jax
 import numpy as np
 
 from headway.errors import PlanningError
-from headway.experiment.methods import make_config
 from headway.planning import agent as agent_module
 from headway.planning.controller import Controller
 from headway.training.loading import initial, learner_of, load_task
+from headway.training.methods import make_config
 
 REPORTS = 20
 WARM_UP = 2000
@@ -32,7 +32,7 @@ TINY = {
     "model.backward_net": False,
     "planner.num_particles": 1,
     "planner.num_candidates": 10,
-    "planner.num_elites": 2,
+    "planner.optimizer.num_elites": 2,
     "planner.horizon": 5,
     "planner.num_iterations": 2,
 }

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from headway.config import FittingConfig, ModelConfig, PlannerConfig
+from headway.config import FittingConfig, MultiHeadedConfig, PlannerConfig
 from headway.data import Episodes, Samples, Trajectory
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitData, FitSetup, FitState, make_data
@@ -18,12 +18,12 @@ EPISODE_LENGTH = 200
 
 def make_agent(
     num_envs: int,
-    model: ModelConfig | None = None,
+    model: MultiHeadedConfig | None = None,
     planner: PlannerConfig | None = None,
     prior: Prior | None = None,
 ) -> tuple[Agent, AgentState, jax.Array]:
     """An untrained agent, its first state, and what it sees; the paper's settings by default."""
-    model, planner = model or ModelConfig(), planner or PlannerConfig()
+    model, planner = model or MultiHeadedConfig(), planner or PlannerConfig()
     task = env_spec("half-cheetah").make_task()
     dynamics = MultiHeadDynamics.init(model, task, key=jax.random.key(0))
     statistics = Statistics.identity(task, model.history_length)
@@ -53,7 +53,7 @@ def make_trajectories(task: Task, num_episodes: int, length: int) -> list[Trajec
 
 
 def make_fit(
-    num_episodes: int, capacity: int, model: ModelConfig, fitting: FittingConfig
+    num_episodes: int, capacity: int, model: MultiHeadedConfig, fitting: FittingConfig
 ) -> tuple[FitState, FitSetup, FitData]:
     """A new model, and episodes of HalfCheetah's size on the device.
 

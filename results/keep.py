@@ -14,11 +14,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from headway import settings
+from headway import config as settings
 from headway.config import Config
-from headway.experiment.methods import make_config
 from headway.storage.iterations import manifest_name
 from headway.sweeps.jobs import fingerprint
+from headway.training.methods import make_config
 from headway.training.run import TABLES, RunDir
 
 

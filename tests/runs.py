@@ -3,8 +3,8 @@
 import hashlib
 import json
 
-from headway.experiment.methods import make_config
-from headway.settings import to_dict
+from headway.config import to_dict
+from headway.training.methods import make_config
 from headway.training.progress import Progress
 from headway.training.run import SCHEMA, TABLES, RunDir, write_json
 

@@ -15,7 +15,7 @@ from targets import Target
 from workloads import make_agent
 
 import headway
-from headway.config import ModelConfig, PlannerConfig
+from headway.config import CEMConfig, MultiHeadedConfig, PlannerConfig
 
 PLAN = Target("plan", "cpu", "a plan", 0.8, "ratio", "")
 RATE = Target("updates", "cpu", "updates", 100.0, "value", "/s", "at least")
@@ -103,9 +103,13 @@ def test_time_belongs_to_the_operation_that_began_last():
 
 @pytest.fixture(scope="module")
 def small_plan():
-    model = ModelConfig(num_members=2, hidden_sizes=(8, 8), context_hidden_sizes=(8,))
+    model = MultiHeadedConfig(num_members=2, hidden_sizes=(8, 8), context_hidden_sizes=(8,))
     planner = PlannerConfig(
-        horizon=2, num_candidates=8, num_elites=2, num_iterations=2, num_particles=2
+        horizon=2,
+        num_candidates=8,
+        optimizer=CEMConfig(num_elites=2),
+        num_iterations=2,
+        num_particles=2,
     )
     agent, state, obs = make_agent(1, model, planner)
     return lambda: agent.act(state, obs)

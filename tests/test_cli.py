@@ -11,9 +11,9 @@ import pytest
 from headway import api
 from headway.cli import COMMANDS, main, parse, read_seeds, read_settings
 from headway.errors import ConfigError, RunError
-from headway.experiment.methods import METHODS, PRESETS, make_config
 from headway.lab import figures
 from headway.training.evaluate import PlanningCost
+from headway.training.methods import METHODS, PRESETS, make_config
 from headway.training.run import EpisodeRow, RunDir
 from headway.training.stopping import Terminated
 
@@ -94,7 +94,10 @@ def test_top_help_and_version(capsys):
         (["train", "pendulum", "--planner.horizn", "3"], "--planner.horizon INT"),
         (["train", "pendulum", "--planner.horizon", "x"], "--planner.horizon: invalid"),
         (["train", "pendulum", "--fitting.oracle", "trajectroy"], "'trajectory'"),
-        (["train", "pendulum", "--planner.num-elites", "900"], "num_elites is 900, allowed: "),
+        (
+            ["train", "pendulum", "--planner.optimizer.num-elites", "900"],
+            "num_elites is 900, allowed: ",
+        ),
         (["evaluate"], "RUN"),
         (["list", "envs", "--jason"], "--json"),
         (["list", "env"], "'envs'"),

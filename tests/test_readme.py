@@ -13,10 +13,10 @@ import pytest
 import headway
 from headway import task
 from headway.cli import main
-from headway.config import model
+from headway.config import MODELS, OwnModelConfig, setting_names
 from headway.errors import ConfigError
-from headway.experiment import learners, methods
-from headway.settings import setting_names
+from headway.experiment import learners
+from headway.training import methods
 from headway.training.loading import load_agent
 from headway.training.run import RunDir
 
@@ -178,8 +178,7 @@ def ridge(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(methods, "METHODS", dict(methods.METHODS))
         patch.setattr(learners, "_LEARNERS", dict(learners._LEARNERS))
-        patch.setattr(model, "OWN_KINDS", set())
-        patch.setattr(learners, "OWN_KINDS", model.OWN_KINDS)
+        patch.setitem(MODELS, "ridge", OwnModelConfig)
         patch.chdir(tmp_path_factory.mktemp("methods"))
         exec(compile(code.replace('"quick"', '"smoke"'), "methods.md", "exec"), names)
         yield names

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from headway.config import ModelConfig
+from headway.config import MultiHeadedConfig
 from headway.data import Episodes, Samples, Trajectory
 from headway.models.dynamics import GaussianNet, MultiHeadDynamics, Statistics
 from headway.models.networks import Dense, DenseHeads
@@ -44,7 +44,7 @@ class ScaledTask(PointTask):
         return jnp.concatenate([obs[..., :1], jnp.sin(obs[..., 1:]), jnp.cos(obs[..., 1:])], -1)
 
 
-SMALL = ModelConfig(
+SMALL = MultiHeadedConfig(
     num_members=2,
     num_heads=2,
     hidden_sizes=(8, 8),

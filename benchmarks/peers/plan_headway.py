@@ -11,7 +11,7 @@ import jax
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from workloads import make_agent, planners
 
-from headway.experiment.methods import make_config
+from headway.training.methods import make_config
 
 
 def main() -> None:

@@ -26,10 +26,10 @@ from measure import name_of
 
 from headway.config import Config
 from headway.data import Trajectory
-from headway.experiment.methods import config_to_evaluate
 from headway.storage.records import read_csv, write_csv
 from headway.training.collect import AgentPolicy, Environments, Episode, run_episodes
 from headway.training.loading import load_agent
+from headway.training.methods import config_to_evaluate
 from headway.training.run import RunDir
 
 COLUMNS = (

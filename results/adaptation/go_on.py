@@ -12,12 +12,11 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
-from headway.config import Config
+from headway.config import Config, override
 from headway.experiment.learners import Learned, make_learner
 from headway.experiment.loading import load_learned, load_task
 from headway.experiment.training import Keys
 from headway.models.fitting import EpochStats
-from headway.settings import override
 from headway.storage import arrays, config_file, files
 from headway.storage.iterations import checkpoint_name, manifest_name
 from headway.storage.manifest import Digest, Manifest

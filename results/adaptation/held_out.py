@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from headway.config import override
 from headway.data import Episodes, Trajectory
 from headway.experiment.learners import Learned, make_learner
 from headway.experiment.learners import multi_headed as learners
@@ -26,7 +27,6 @@ from headway.experiment.training import Keys
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.planning.last_layer import training
 from headway.planning.last_layer.regression import see_episode
-from headway.settings import override
 from headway.storage.records import write_csv
 from headway.storage.run_dir import RunDir
 from headway.task import episode_length

@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import headway
-from headway.config import Config
+from headway.config import Config, override
 from headway.report.tables import by_physics
-from headway.settings import override
 from headway.storage.records import read_csv, write_csv
 from headway.training.progress import make_progress
 from headway.training.run import EVALUATION_COLUMNS, EpisodeRow, RunDir

@@ -15,10 +15,10 @@ from typing import Any
 from measure import ARMS, name_of
 
 from headway.data import Trajectory
-from headway.experiment.methods import config_to_control
 from headway.report.diagnosis import examined
 from headway.storage.records import read_csv, write_csv
 from headway.training.evaluate import run_tests
+from headway.training.methods import config_to_evaluate
 from headway.training.run import RunDir
 
 COLUMNS = (
@@ -47,7 +47,7 @@ def measure(
     """Apply some rules to some episodes; one row per rule and group."""
     rows = []
     for rule in rules:
-        config = config_to_control(run.config(), RULES[rule])
+        config = config_to_evaluate(run.config(), RULES[rule], ("planner",))
         diagnosis = examined(run, config, episodes)
         for group in diagnosis.episodes:
             summary = diagnosis.summary(group)

@@ -21,11 +21,11 @@ import numpy as np
 
 import headway
 from headway.config import Config, PlannerConfig
-from headway.experiment.methods import config_to_evaluate
 from headway.report.tables import by_physics
 from headway.storage.records import read_csv, write_csv
 from headway.storage.run_dir import RunDir
 from headway.task import sim_param_sets
+from headway.training.methods import config_to_evaluate
 from headway.training.progress import make_progress
 
 COLUMNS = (

@@ -3,6 +3,7 @@
 from .api import Evaluation as Evaluation
 from .api import Run as Run
 from .api import evaluate as evaluate
+from .api import load as load
 from .api import train as train
 from .config import Config as Config
 from .data import Trajectory as Trajectory
@@ -20,11 +21,6 @@ from .experiment.learners import Fit as Fit
 from .experiment.learners import Learned as Learned
 from .experiment.learners import Learner as Learner
 from .experiment.learners import register_learner as register_learner
-from .experiment.methods import METHODS as METHODS
-from .experiment.methods import Method as Method
-from .experiment.methods import make_config as make_config
-from .experiment.methods import register_method as register_method
-from .experiment.presets import PRESETS as PRESETS
 from .models.dynamics import MultiHeadDynamics as MultiHeadDynamics
 from .models.updates import EpochStats as EpochStats
 from .planning.agent import Agent as Agent
@@ -41,12 +37,16 @@ from .report.dynamics import plot_dynamics as plot_dynamics
 from .report.page.build import write_report as write_report
 from .report.recording import Recording as Recording
 from .report.recording import record as record
-from .service import load as load
 from .sim_params import SimParamSets as SimParamSets
 from .task import EnvSpec as EnvSpec
 from .task import Task as Task
 from .task import env_spec as env_spec
 from .task import register as register
+from .training.methods import METHODS as METHODS
+from .training.methods import PRESETS as PRESETS
+from .training.methods import Method as Method
+from .training.methods import make_config as make_config
+from .training.methods import register_method as register_method
 from .training.run import EpisodeRow as EpisodeRow
 from .training.run import RunDir as RunDir
 

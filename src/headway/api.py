@@ -1,26 +1,25 @@
-"""What most users need: train, evaluate; `headway.service` loads."""
+"""Train, evaluate, load. Importing this, and loading a controller, bring in no simulator."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
 from headway.config import Config
-from headway.experiment.methods import make_config
-from headway.models.compilation import prepare_jax
-from headway.planning.controller import Controller
-from headway.service import load
-from headway.training.evaluate import PlanningCost, run_tests
-from headway.training.progress import Progress
-from headway.training.run import EpisodeRow, format_sim_params
-from headway.training.train import train_run
+from headway.training.methods import config_to_evaluate, make_config
+from headway.training.run import EpisodeRow, RunDir, format_sim_params
+
+if TYPE_CHECKING:
+    from headway.planning.controller import Controller
+    from headway.training.evaluate import PlanningCost
+    from headway.training.progress import Progress
 
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """A trained run and what it measured."""
+    """A trained run and its measurements."""
 
     path: Path
     """The run directory."""
@@ -31,28 +30,28 @@ class Run:
     evaluation: list[EpisodeRow]
     """Every test episode, as in `evaluation.csv`."""
 
-    def controller(self, *, seed: int = 0, **options: Any) -> Controller:
+    def controller(self, *, seed: int = 0, **options: Any) -> "Controller":
         """The trained controller; options are those of `load`."""
         return load(self.path, seed=seed, **options)
 
     def __repr__(self) -> str:
-        """Where it is and how its last tests went; its fields say more."""
+        """One line: directory and last test returns."""
         config, last = self.config, max((row.iteration for row in self.evaluation), default=0)
         tests = [row for row in self.evaluation if row.iteration == last]
-        what = f"{config.method} on {config.env}, seed {config.seed}"
-        what += f", {len(self.metrics)} iterations{_told(tests)}"
-        return f"Run({str(self.path)!r}: {what})"
+        name = f"{config.method} on {config.env}, seed {config.seed}"
+        name += f", {len(self.metrics)} iterations{_returns(tests)}"
+        return f"Run({str(self.path)!r}: {name})"
 
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation(Sequence[EpisodeRow]):
-    """Test episodes of a trained run, one after the other, and what planning them took."""
+    """Test episodes of a trained run, one after the other, and the cost of planning them."""
 
     rows: list[EpisodeRow]
     """Every test episode."""
     config: Config
     """All settings, as they were tested."""
-    cost: PlanningCost
+    cost: "PlanningCost"
     """Candidates, arithmetic and time per step."""
 
     @overload
@@ -66,12 +65,12 @@ class Evaluation(Sequence[EpisodeRow]):
         return len(self.rows)
 
     def __repr__(self) -> str:
-        """How each group went; the fields say more."""
-        what = f"{self.config.method} on {self.config.env}, {len(self)} episodes"
-        return f"Evaluation({what}{_told(self.rows)})"
+        """One line: the returns of each group."""
+        name = f"{self.config.method} on {self.config.env}, {len(self)} episodes"
+        return f"Evaluation({name}{_returns(self.rows)})"
 
 
-def _told(rows: Sequence[EpisodeRow]) -> str:
+def _returns(rows: Sequence[EpisodeRow]) -> str:
     """Mean return of each group in a few words; every physics of it counts once."""
     groups: dict[str, dict[str, list[float]]] = {}
     for row in rows:
@@ -91,7 +90,7 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
     seed: int = 0,
     run_dir: str | Path | None = None,
     settings: Mapping[str, Any] | None = None,
-    progress: Progress | None = None,
+    progress: "Progress | None" = None,
     resume_from_last_good: bool = False,
 ) -> Run:
     """Train a controller on environments whose physics vary; resume if it was begun before.
@@ -115,11 +114,15 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
         BadEnvironmentError: The environment broke its contract.
         DivergenceError: Fitting lost all finite numbers.
     """
+    from headway.models.compilation import prepare_jax
+    from headway.training.train import train_run
+
     prepare_jax()
     config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
+    usual = Path("runs") / f"{config.env}-{method}-{preset}-seed{seed}"
     run = train_run(
         config,
-        run_dir or default_run_dir(config),
+        run_dir or usual,
         progress,
         resume_from_last_good=resume_from_last_good,
     )
@@ -132,7 +135,7 @@ def evaluate(
     groups: Sequence[str] | None = None,
     num_episodes: int | None = None,
     settings: Mapping[str, Any] | None = None,
-    progress: Progress | None = None,
+    progress: "Progress | None" = None,
 ) -> Evaluation:
     """Test a trained run once more; nothing in its directory changes.
 
@@ -150,6 +153,9 @@ def evaluate(
         ConfigError: A setting is unknown, of the wrong type or out of range, or one that
             training has fixed.
     """
+    from headway.models.compilation import prepare_jax
+    from headway.training.evaluate import PlanningCost, run_tests
+
     prepare_jax()
     tested = run_tests(
         run_dir, groups=groups, num_episodes=num_episodes, settings=settings, progress=progress
@@ -159,6 +165,32 @@ def evaluate(
     return Evaluation(rows, tested.config, cost)
 
 
-def default_run_dir(config: Config) -> Path:
-    """Where a run goes when no directory is named."""
-    return Path("runs") / f"{config.env}-{config.method}-{config.preset}-seed{config.seed}"
+def load(
+    run_dir: str | Path,
+    *,
+    seed: int = 0,
+    settings: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> "Controller":
+    """Load the controller of a run.
+
+    Args:
+        run_dir: The run directory.
+        seed: Seeds the planner's draws.
+        settings: Changes of `planner` settings by dotted name, for example
+            `{"planner.num_candidates": 50}`, to control with another planner.
+        options: Those of `Controller`, for example `deadline_ms=50`.
+
+    Raises:
+        RunError: There is no trained run, or it is damaged.
+        ConfigError: A setting is unknown, of the wrong type or out of range, or none of the
+            planner's; or as `Controller`.
+    """
+    from headway.models.compilation import prepare_jax
+    from headway.planning.controller import Controller
+    from headway.training.loading import load_agent
+
+    prepare_jax()
+    run = RunDir(run_dir)
+    config = config_to_evaluate(run.config(), settings or {}, ("planner",))
+    return Controller(load_agent(run, config), seed=seed, **options)

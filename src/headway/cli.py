@@ -24,7 +24,10 @@ from headway.config import (
     EvaluationConfig,
     FittingConfig,
     ModelConfig,
+    MultiHeadedConfig,
     PlannerConfig,
+    flatten,
+    override,
 )
 from headway.errors import ConfigError, HeadwayError, unknown_name
 
@@ -35,6 +38,8 @@ TERMINATED = 143  # as a shell reports SIGTERM
 PAPER_ENVS = (
     "cartpole-swingup", "pendulum", "hopper", "slim-humanoid", "half-cheetah", "crippled-ant",
 )  # fmt: skip
+
+SECTIONS = ("model", "fitting", "planner", "collection", "evaluation")
 
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
@@ -55,6 +60,11 @@ class Names:
     """First of all an environment or a run."""
     method: str = "tmcl"
     preset: str = "paper"
+    optimizer: Annotated[str | None, tyro.conf.arg(name="planner.optimizer.name")] = None
+
+    def settings(self) -> dict[str, str]:
+        """Choices among settings that others depend on, by dotted name."""
+        return {} if self.optimizer is None else {"planner.optimizer.name": self.optimizer}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,12 +108,15 @@ class Command:
 
     def changed(self, config: Config) -> dict[str, Any]:
         """Settings by dotted name that differ from those of a configuration."""
-        return {
-            f"{section}.{name}": value
-            for section in ("model", "fitting", "planner", "collection", "evaluation")
-            for name, value in vars(getattr(self, section, config)).items()
-            if hasattr(self, section) and value != getattr(getattr(config, section), name)
-        }
+        mine = {name: getattr(self, name) for name in SECTIONS if hasattr(self, name)}
+        chosen = {}
+        if mine["planner"].optimizer.name != config.planner.optimizer.name:
+            chosen = {"planner.optimizer.name": mine["planner"].optimizer.name}
+        default = override(config, chosen)
+        usual = {name: dataclasses.asdict(getattr(default, name)) for name in mine}
+        asked = {name: dataclasses.asdict(section) for name, section in mine.items()}
+        before = flatten(usual)
+        return chosen | {n: v for n, v in flatten(asked).items() if v != before[n]}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,26 +143,28 @@ class Train(Command):
     """Switches of the environment: NAME=on or NAME=off."""
     resume_from_last_good: Flag = False
     """Where a file of the run is damaged, go back to the newest iteration that is intact."""
-    model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
-    fitting: FittingConfig = dataclasses.field(default_factory=FittingConfig)
-    planner: PlannerConfig = dataclasses.field(default_factory=PlannerConfig)
-    collection: CollectionConfig = dataclasses.field(default_factory=CollectionConfig)
-    evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
+    model: ModelConfig = MultiHeadedConfig()
+    fitting: FittingConfig = FittingConfig()
+    planner: PlannerConfig = PlannerConfig()
+    collection: CollectionConfig = CollectionConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
 
     def with_defaults(self, names):
         """Take the settings of environment, method and preset."""
-        from headway.experiment.methods import make_config
+        from headway.training.methods import make_config
 
         if not names.words:
             return self
-        config = make_config(names.words[0], method=names.method, preset=names.preset)
-        taken = ("method", "preset", "model", "fitting", "planner", "collection", "evaluation")
+        config = make_config(
+            names.words[0], method=names.method, preset=names.preset, settings=names.settings()
+        )
+        taken = ("method", "preset", *SECTIONS)
         return dataclasses.replace(self, **{name: getattr(config, name) for name in taken})
 
     def settings(self) -> dict[str, Any]:
         """Settings by dotted name that differ from those of method and preset."""
-        from headway.experiment.methods import make_config
         from headway.task import env_spec
+        from headway.training.methods import make_config
 
         config = make_config(self.env, method=self.method, preset=self.preset)
         settings = self.changed(config)
@@ -216,7 +231,7 @@ class _OfRun(Command):
 
     run_dir: RunPath = tyro.MISSING
     """The run directory."""
-    planner: PlannerConfig = dataclasses.field(default_factory=PlannerConfig)
+    planner: PlannerConfig = PlannerConfig()
 
     def config(self) -> Config:
         """Read the settings of the run."""
@@ -229,6 +244,7 @@ class _OfRun(Command):
         if not names.words:
             return self
         config = dataclasses.replace(self, run_dir=Path(names.words[0])).config()
+        config = override(config, names.settings())
         taken = [name for name in ("planner", "evaluation") if hasattr(self, name)]
         return dataclasses.replace(self, **{name: getattr(config, name) for name in taken})
 
@@ -245,7 +261,7 @@ class Evaluate(_OfRun):
     """Groups of physics: `train` or unseen groups."""
     episodes: Annotated[int | None, _unless_given("as in the run's own tests")] = None
     """Episodes per group; the same as --evaluation.num-episodes."""
-    evaluation: EvaluationConfig = dataclasses.field(default_factory=EvaluationConfig)
+    evaluation: EvaluationConfig = EvaluationConfig()
 
     def run(self, words):
         """Test, print returns per physics, and what planning took."""

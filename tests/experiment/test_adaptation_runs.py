@@ -3,8 +3,8 @@
 import numpy as np
 
 import headway
-from headway.experiment.methods import config_to_evaluate
 from headway.training import loading
+from headway.training.methods import config_to_evaluate
 from headway.training.run import RunDir
 
 LAST_LAYER = {"planner.adaptation": "last-layer"}

@@ -5,8 +5,8 @@ import pytest
 
 import headway
 from headway.errors import ConfigError
-from headway.experiment.methods import make_config
 from headway.training import train
+from headway.training.methods import make_config
 
 TINY = {"collection.episode_length": 30, "fitting.epochs": 2}
 SPREAD = [

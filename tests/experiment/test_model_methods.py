@@ -7,11 +7,11 @@ import pytest
 
 import headway
 import headway.envs
+from headway.config import differences
 from headway.data import Trajectory
-from headway.experiment.methods import make_config, told_sim_params
 from headway.models.dynamics import network_input
-from headway.settings import differences
 from headway.training import loading, train
+from headway.training.methods import make_config, told_sim_params
 
 NEW = ("stacked", "cadm", "pets-cadm", "oracle-params", "ria")
 TINY = {"collection.episode_length": 12, "fitting.epochs": 1}

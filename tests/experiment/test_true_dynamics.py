@@ -8,7 +8,6 @@ import pytest
 import headway
 from headway.envs.built_in import ClassicVectorEnv, RobotVectorEnv
 from headway.errors import ConfigError
-from headway.experiment.methods import make_config
 from headway.experiment.true_dynamics import (
     ClassicDynamics,
     RobotSimulator,
@@ -19,11 +18,12 @@ from headway.planning.controller import env_action
 from headway.planning.returns import RolloutSettings, candidate_returns
 from headway.task import env_names, env_spec
 from headway.training.collect import Environments
+from headway.training.methods import make_config
 
 CLASSIC = ["pendulum", "cartpole-swingup"]
 ROBOTS = ["hopper", "slim-humanoid", "half-cheetah", "crippled-ant"]
 SHORT = {"collection.episode_length": 6}
-SMALL = {"planner.num_candidates": 6, "planner.num_elites": 2, "planner.horizon": 5}
+SMALL = {"planner.num_candidates": 6, "planner.optimizer.num_elites": 2, "planner.horizon": 5}
 
 
 def every_physics(env):
@@ -145,7 +145,11 @@ def test_a_run_on_the_simulator_can_be_tested_again(tmp_path):
 
 
 def test_the_simulator_beats_random_actions(tmp_path):
-    settings = {"planner.horizon": 15, "planner.num_candidates": 60, "planner.num_elites": 10}
+    settings = {
+        "planner.horizon": 15,
+        "planner.num_candidates": 60,
+        "planner.optimizer.num_elites": 10,
+    }
     longer = {"collection.episode_length": 100, "collection.num_episodes": 8}
     returns = {}
     for method, changes in (("random", longer), ("true-dynamics", settings | longer)):

@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from headway.errors import RunError
-from headway.experiment.methods import METHODS
 from headway.lab import figures
 from headway.lab.figures import save_run_figures
 from headway.sweeps.experiments import Arm, experiment, sweep_experiment
+from headway.training.methods import METHODS
 
 ALL = ["learning_curve.png", "evaluation.png", "head_shares.png", "prediction_error.png"]
 

@@ -10,7 +10,6 @@ import pytest
 from rich.console import Console
 
 from headway.errors import RunError
-from headway.experiment.methods import make_config
 from headway.lab.tables import (
     axis_label,
     by_group,
@@ -23,6 +22,7 @@ from headway.lab.tables import (
     read_runs,
     varying,
 )
+from headway.training.methods import make_config
 from headway.training.run import EpisodeRow
 
 HOSTILE = '<script>alert("1")</script>&amp;$x_{2}$'

@@ -5,19 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import toys
-from headway.config import FittingConfig, ModelConfig
+from headway.config import FittingConfig, GradientAdaptedConfig
 from headway.models.adapted import Window
 from headway.models.fitting import make_data
 
-TINY = ModelConfig(
-    kind="gradient-adapted",
-    num_members=1,
-    num_heads=1,
-    hidden_sizes=(5,),
-    context_size=0,
-    backward_net=False,
-    deterministic=True,
-)
+TINY = GradientAdaptedConfig(hidden_sizes=(5,))
 
 
 def random_window(seed, *shape):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import toys
-from headway.config import ModelConfig
+from headway.config import MultiHeadedConfig
 from headway.data import Episodes, History
 from headway.errors import ConfigError
 from headway.models.dynamics import MultiHeadDynamics, Statistics, context_size
@@ -125,4 +125,4 @@ def test_episodes_carry_the_parameters_that_a_model_is_told_and_no_others():
 )
 def test_settings_that_contradict_each_other_are_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
-        ModelConfig(**settings)
+        MultiHeadedConfig(**settings)

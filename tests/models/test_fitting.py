@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import toys
-from headway.config import FittingConfig, ModelConfig
+from headway.config import FittingConfig, MultiHeadedConfig
 from headway.data import Trajectory
 from headway.models import fitting
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitSetup, assign_segments, fit_epoch, make_data
 
-LINEAR = ModelConfig(
+LINEAR = MultiHeadedConfig(
     num_members=2, num_heads=2, hidden_sizes=(16,), context_size=0, backward_net=False
 )
 

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 import toys
-from headway.config import FittingConfig, ModelConfig
+from headway.config import FittingConfig, MultiHeadedConfig
 from headway.errors import ConfigError
-from headway.experiment.methods import make_config
 from headway.models import compilation, fitting
 from headway.models.compilation import in_each_precision
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitSetup, episode_losses, fit_epoch, make_data
 from headway.models.products import affine, rounded
+from headway.training.methods import make_config
 
-TWO_LAYERS = ModelConfig(
+TWO_LAYERS = MultiHeadedConfig(
     num_members=2, num_heads=2, hidden_sizes=(8, 8), context_size=3, context_hidden_sizes=(5,)
 )
 

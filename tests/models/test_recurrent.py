@@ -1,14 +1,12 @@
 """ReBAL's network against a NumPy twin; its truncated gradient; learning what only memory shows."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from adaptive_helpers import TINY, random_window, toy_data
+from adaptive_helpers import random_window, toy_data
 
 import toys
-from headway.config import FittingConfig
+from headway.config import FittingConfig, RecurrentConfig
 from headway.models.adapted import Window
 from headway.models.recurrent import (
     RecurrentNet,
@@ -22,7 +20,7 @@ truncated = jax.jit(batch_gradient, static_argnums=2)
 
 
 def tiny_net(seed=0, sizes=(3, 4)):
-    config = dataclasses.replace(TINY, kind="recurrent", hidden_sizes=sizes)
+    config = RecurrentConfig(hidden_sizes=sizes)
     net = RecurrentNet.init(config, toys.POINT, key=jax.random.key(seed))
     rng = np.random.default_rng(seed)
     return jax.tree.map(lambda x: x + 0.1 * jnp.asarray(rng.normal(size=x.shape), x.dtype), net)
@@ -59,7 +57,7 @@ def test_steps_equal_a_numpy_twin():
 
 
 def test_forget_gates_begin_open():
-    config = dataclasses.replace(TINY, kind="recurrent", hidden_sizes=(3,))
+    config = RecurrentConfig(hidden_sizes=(3,))
     (layer,) = RecurrentNet.init(config, toys.POINT, key=jax.random.key(0)).layers
     np.testing.assert_array_equal(layer.bias[0], [0] * 3 + [1] * 3 + [0] * 6)
 
@@ -134,7 +132,7 @@ def test_memory_tells_physics_apart():
     setup = RecurrentSetup(
         toys.POINT, FittingConfig(batch_size=54, backprop_steps=12, learning_rate=1e-2)
     )
-    config = dataclasses.replace(TINY, kind="recurrent", hidden_sizes=(24,))
+    config = RecurrentConfig(hidden_sizes=(24,))
     net = RecurrentNet.init(config, toys.POINT, key=jax.random.key(0))
     state = Fitted.new(net, 1e-2)
     for epoch in range(120):

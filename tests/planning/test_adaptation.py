@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import toys
-from headway.config import PlannerConfig
+from headway.config import CEMConfig, PlannerConfig
 from headway.errors import ConfigError
 from headway.models.dynamics import MultiHeadDynamics
 from headway.planning.agent import Agent, reset_where
@@ -19,7 +19,7 @@ from headway.planning.last_layer.regression import Prior
 LAST_LAYER = PlannerConfig(
     horizon=4,
     num_candidates=40,
-    num_elites=8,
+    optimizer=CEMConfig(num_elites=8),
     num_iterations=3,
     num_particles=2,
     selection_length=3,

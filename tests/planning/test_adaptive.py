@@ -1,6 +1,5 @@
 """Agents whose model changes while they act: what they remember, forget and imagine."""
 
-import dataclasses
 import functools
 
 import equinox as eqx
@@ -10,9 +9,8 @@ import numpy as np
 import pytest
 
 import toys
-from headway.config import ModelConfig, PlannerConfig
+from headway.config import CEMConfig, GradientAdaptedConfig, PlannerConfig, RecurrentConfig
 from headway.errors import ConfigError
-from headway.experiment.methods import METHODS
 from headway.models.adapted import ReluNet, Window, adapt
 from headway.models.dynamics import network_input
 from headway.models.recurrent import RecurrentNet
@@ -22,19 +20,16 @@ from headway.planning.heads import RecentTransitions
 from headway.planning.meta.agent import AdaptiveAgent, imagine
 from headway.planning.meta.models import GradientAdapted, Recurrent, Transition
 from headway.planning.returns import RolloutSettings, candidate_returns
+from headway.training.methods import METHODS
 
 TASK = toys.ScaledTask()
-CONFIG = ModelConfig(
-    kind="recurrent",
-    num_members=1,
-    num_heads=1,
-    hidden_sizes=(6, 5),
-    context_size=0,
-    backward_net=False,
-    deterministic=True,
-)
+SIZES = (6, 5)
 PLANNER = PlannerConfig(
-    horizon=3, num_candidates=8, num_elites=2, num_iterations=2, num_particles=1
+    horizon=3,
+    num_candidates=8,
+    optimizer=CEMConfig(num_elites=2),
+    num_iterations=2,
+    num_particles=1,
 )
 KINDS = ["gradient", "recurrent"]
 
@@ -44,10 +39,14 @@ close = functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6)
 def model_of(kind, length=3, rate=0.1):
     statistics = toys.odd_statistics(TASK)
     if kind == "gradient":
-        config = dataclasses.replace(CONFIG, kind="gradient-adapted")
+        config = GradientAdaptedConfig(hidden_sizes=SIZES)
         net = ReluNet.init(config, TASK, key=jax.random.key(0))
         return GradientAdapted(net, statistics, TASK, length, rate)
-    return Recurrent(RecurrentNet.init(CONFIG, TASK, key=jax.random.key(0)), statistics, TASK)
+    return Recurrent(
+        RecurrentNet.init(RecurrentConfig(hidden_sizes=SIZES), TASK, key=jax.random.key(0)),
+        statistics,
+        TASK,
+    )
 
 
 def transitions(count, num_envs=2, seed=0):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import toys
-from headway.config import PlannerConfig
+from headway.config import CEMConfig, ICEMConfig, MPPIConfig, PlannerConfig, RandomShootingConfig
 from headway.models.dynamics import Statistics
 from headway.planning import agent as agent_module
 from headway.planning.agent import Agent, planning_heads, reset_where
@@ -16,7 +16,7 @@ from headway.planning.agent import Agent, planning_heads, reset_where
 TINY = PlannerConfig(
     horizon=4,
     num_candidates=60,
-    num_elites=10,
+    optimizer=CEMConfig(num_elites=10),
     num_iterations=4,
     num_particles=2,
     selection_length=2,
@@ -97,14 +97,17 @@ def test_history_of_a_real_episode_equals_that_of_its_trajectory(selection_lengt
 
 @pytest.mark.parametrize(
     "settings",
-    [{"optimizer": "icem", "num_iterations": 2}, {"optimizer": "mppi"}],
+    [
+        {"optimizer": ICEMConfig(initial_std=0.4321), "num_iterations": 2},
+        {"optimizer": MPPIConfig(initial_std=0.4321)},
+    ],
     ids=str,
 )
 def test_act_is_traced_once_whatever_the_optimizer_remembers(settings, monkeypatch):
     traces = []
     original = agent_module.encode
     monkeypatch.setattr(agent_module, "encode", lambda *x: traces.append(1) or original(*x))
-    agent = make_agent(initial_std=0.4321, **settings)
+    agent = make_agent(**settings)
     state, _, _ = play(agent, [1.0, -1.0], 2)
     play(agent, [1.0, -1.0], 2, state=reset_where(state, start(agent), jnp.asarray([True, False])))
     assert len(traces) == 1
@@ -155,7 +158,7 @@ def test_an_environment_without_finite_returns_keeps_its_guess_and_is_counted_al
 
 
 def test_next_guess_is_the_plan_shifted_by_one_and_ends_in_zero():
-    agent = make_agent(optimizer="random-shooting")
+    agent = make_agent(optimizer=RandomShootingConfig())
     state, decision = agent.act(start(agent), jnp.asarray([[0.5, 0.5], [0.1, -0.4]]))
     np.testing.assert_array_equal(state.search.guess[:, -1], 0.0)
     assert np.asarray(state.search.guess[:, :-1]).all()

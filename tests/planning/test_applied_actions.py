@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import toys
-from headway.config import ModelConfig, PlannerConfig
+from headway.config import CEMConfig, MultiHeadedConfig, PlannerConfig
 from headway.errors import ConfigError
 from headway.models.adapted import ReluNet
 from headway.planning.acting import RandomAgent
@@ -19,7 +19,7 @@ from headway.planning.meta.models import GradientAdapted
 PLANNER = PlannerConfig(
     horizon=3,
     num_candidates=40,
-    num_elites=5,
+    optimizer=CEMConfig(num_elites=5),
     num_iterations=2,
     num_particles=2,
     selection_length=3,
@@ -84,7 +84,7 @@ def test_nothing_is_learned_from_a_step_whose_action_is_not_known():
 
 
 def test_a_model_that_adapts_learns_from_what_was_applied():
-    config = ModelConfig(hidden_sizes=(4,), num_members=1, num_heads=1, deterministic=True)
+    config = MultiHeadedConfig(hidden_sizes=(4,), num_members=1, num_heads=1, deterministic=True)
     net = ReluNet.init(config, TASK, key=jax.random.key(0))
     model = GradientAdapted(net, toys.identity_statistics(TASK), TASK, 2, 0.1)
     controller = Controller(AdaptiveAgent(model, TASK, PLANNER))

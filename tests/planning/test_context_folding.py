@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import toys
-from headway.config import PlannerConfig
+from headway.config import CEMConfig, PlannerConfig
 from headway.errors import ConfigError
 from headway.models.dynamics import network_input
 from headway.planning.agent import Agent, encode
@@ -23,7 +23,11 @@ NAMES = ("gain", "drag")
 CONFIG = dataclasses.replace(toys.SMALL, hidden_sizes=(8, 7, 6))
 PLACES = ["input", "last-hidden", "head"]
 PLANNER = PlannerConfig(
-    horizon=3, num_candidates=12, num_elites=4, num_iterations=2, num_particles=2
+    horizon=3,
+    num_candidates=12,
+    optimizer=CEMConfig(num_elites=4),
+    num_iterations=2,
+    num_particles=2,
 )
 
 

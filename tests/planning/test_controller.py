@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import toys
-from headway.config import PlannerConfig
+from headway.config import CEMConfig, ICEMConfig, MPPIConfig, PlannerConfig, RandomShootingConfig
 from headway.errors import ConfigError, PlanningError
 from headway.models.dynamics import Statistics
 from headway.planning import agent as agent_module
@@ -23,7 +23,7 @@ from headway.planning.step import scoring
 TINY = PlannerConfig(
     horizon=4,
     num_candidates=60,
-    num_elites=10,
+    optimizer=CEMConfig(num_elites=10),
     num_iterations=4,
     num_particles=2,
     selection_length=2,
@@ -50,9 +50,9 @@ def play(controller, steps, obs=OBS):
 
 OPTIMIZERS = [
     {},
-    {"optimizer": "icem"},
-    {"optimizer": "mppi"},
-    {"optimizer": "random-shooting"},
+    {"optimizer": ICEMConfig()},
+    {"optimizer": MPPIConfig()},
+    {"optimizer": RandomShootingConfig()},
 ]
 
 
@@ -177,7 +177,7 @@ SERVICE = [  # what is seen, how often another iteration fits, what comes of it,
 ]
 
 
-@pytest.mark.parametrize("settings", [{}, {"optimizer": "icem"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"optimizer": ICEMConfig()}], ids=str)
 def test_with_a_deadline_nothing_is_compiled_in_service(settings, monkeypatch, caplog):
     jax.clear_caches()
     controller = Controller(make_agent(**settings), deadline_ms=LONG)
@@ -290,7 +290,9 @@ def test_many_steps_trace_once_and_take_no_more_memory(deadline_ms, steps, monke
     original = agent_module.encode
     monkeypatch.setattr(agent_module, "encode", lambda *x: traces.append(1) or original(*x))
     # A setting that no other test compiled.
-    agent = make_agent(num_iterations=2, initial_std=0.3217 if deadline_ms else 0.3218)
+    agent = make_agent(
+        num_iterations=2, optimizer=CEMConfig(initial_std=0.3217 if deadline_ms else 0.3218)
+    )
     controller = Controller(agent, deadline_ms=deadline_ms)
     rng = np.random.default_rng(0)
 

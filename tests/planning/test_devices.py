@@ -12,11 +12,17 @@ import numpy as np
 import pytest
 
 import toys
-from headway.config import PlannerConfig
+from headway.config import CEMConfig, PlannerConfig
 from headway.planning import devices
 from headway.planning.agent import Agent
 
-TINY = PlannerConfig(horizon=5, num_candidates=40, num_elites=8, num_iterations=3, num_particles=4)
+TINY = PlannerConfig(
+    horizon=5,
+    num_candidates=40,
+    optimizer=CEMConfig(num_elites=8),
+    num_iterations=3,
+    num_particles=4,
+)
 
 
 def make_agent(**settings):
@@ -151,7 +157,13 @@ def resident_kib():
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize("plans", [2_000, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_thousands_of_plans_take_no_more_memory(plans):
-    agent = make_agent(num_candidates=8, num_elites=2, num_iterations=1, num_particles=2, horizon=2)
+    agent = make_agent(
+        num_candidates=8,
+        optimizer=CEMConfig(num_elites=2),
+        num_iterations=1,
+        num_particles=2,
+        horizon=2,
+    )
     state = agent.init(1, key=jax.random.key(0))
     obs = np.zeros((1, 2), np.float32)
     resident = []

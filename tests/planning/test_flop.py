@@ -5,20 +5,31 @@ import dataclasses
 import pytest
 
 import toys
-from headway.config import ModelConfig, PlannerConfig
+from headway.config import (
+    CEMConfig,
+    ICEMConfig,
+    MPPIConfig,
+    MultiHeadedConfig,
+    PlannerConfig,
+    RandomShootingConfig,
+)
 from headway.planning.flop import plan_flop, step_flop
 from headway.task import env_spec
 
-MODEL = ModelConfig(hidden_sizes=(8, 6), num_heads=3)
+MODEL = MultiHeadedConfig(hidden_sizes=(8, 6), num_heads=3)
 PLANNER = PlannerConfig(
-    horizon=5, num_candidates=40, num_elites=8, num_iterations=3, num_particles=10
+    horizon=5,
+    num_candidates=40,
+    optimizer=CEMConfig(num_elites=8),
+    num_iterations=3,
+    num_particles=10,
 )
 PER_STEP = 2 * (4 * 8 + 8 * 6 + 6 * 4)  # two observations and two actions; mean and variance
 
 
 def test_the_papers_half_cheetah():
     task = env_spec("half-cheetah").make_task()
-    assert plan_flop(ModelConfig(), PlannerConfig(), task) == pytest.approx(158.4e9)
+    assert plan_flop(MultiHeadedConfig(), PlannerConfig(), task) == pytest.approx(158.4e9)
 
 
 def test_a_step_of_each_kind_of_heads():
@@ -31,7 +42,12 @@ def test_a_step_of_each_kind_of_heads():
 
 @pytest.mark.parametrize(
     ("optimizer", "evaluations"),
-    [("cem", 120), ("mppi", 120), ("random-shooting", 120), ("icem", 40 + 32 + 25 + 3 * 2 + 1)],
+    [
+        (CEMConfig(num_elites=8), 120),
+        (MPPIConfig(), 120),
+        (RandomShootingConfig(), 120),
+        (ICEMConfig(num_elites=8), 40 + 32 + 25 + 3 * 2 + 1),
+    ],
 )
 def test_a_plan_of_each_optimizer(optimizer, evaluations):
     planner = dataclasses.replace(PLANNER, optimizer=optimizer)

@@ -1,7 +1,5 @@
 """What every optimizer must keep to, and how well each searches a problem with a known answer."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +7,13 @@ import numpy as np
 import pytest
 from search_helpers import ACTIONS, HORIZON, KEY, NUM_ENVS, begin, search, start, towards, watch
 
-from headway.config import PlannerConfig
+from headway.config import (
+    CEMConfig,
+    ICEMConfig,
+    MPPIConfig,
+    PlannerConfig,
+    RandomShootingConfig,
+)
 from headway.planning.optimizers import CEM, ICEM, MPPI, RandomShooting, make_optimizer
 
 ROUNDS = 3
@@ -115,16 +119,15 @@ def test_environments_draw_different_candidates(optimizer):
 
 
 def test_settings_reach_the_optimizer():
-    config = PlannerConfig(
-        num_candidates=9, num_elites=3, num_iterations=2, smoothing=0.3, initial_std=0.4
-    )
-    assert make_optimizer(config) == CEM(9, 3, 2, 0.3, 0.4)
+    def made(optimizer):
+        return make_optimizer(
+            PlannerConfig(num_candidates=9, num_iterations=2, optimizer=optimizer)
+        )
+
+    elites = {"num_elites": 3, "smoothing": 0.3, "initial_std": 0.4}
+    assert made(CEMConfig(**elites)) == CEM(9, 3, 2, 0.3, 0.4)
     memory = {"noise_beta": 1.5, "population_decay": 1.1, "kept_elite_fraction": 0.7}
-    icem = dataclasses.replace(config, optimizer="icem", **memory)
-    assert make_optimizer(icem) == ICEM(9, 3, 2, 0.3, 0.4, **memory)
-    mppi = dataclasses.replace(icem, optimizer="mppi", temperature=0.7)
-    assert make_optimizer(mppi) == MPPI(9, 2, 0.4, 1.5, 0.7)
-    shooting = PlannerConfig(
-        optimizer="random-shooting", num_candidates=9, num_elites=3, num_iterations=2
-    )
-    assert make_optimizer(shooting) == RandomShooting(9, 2)
+    assert made(ICEMConfig(**elites, **memory)) == ICEM(9, 3, 2, 0.3, 0.4, **memory)
+    mppi = MPPIConfig(initial_std=0.4, noise_beta=1.5, temperature=0.7)
+    assert made(mppi) == MPPI(9, 2, 0.4, 1.5, 0.7)
+    assert made(RandomShootingConfig()) == RandomShooting(9, 2)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import toys
+from headway.config import CEMConfig, ICEMConfig, MPPIConfig, RandomShootingConfig
 from headway.planning import returns, search, shares
 from headway.planning.deadline import DeadlinePlanner
 from headway.planning.imagination import ImaginedDynamics
@@ -38,9 +39,9 @@ def sharing(monkeypatch):
         {"num_candidates": 41},
         {"precision": "bfloat16"},
         {"particle_noise": "shared"},
-        {"optimizer": "icem", "num_elites": 4},
-        {"optimizer": "mppi"},
-        {"optimizer": "random-shooting"},
+        {"optimizer": ICEMConfig(num_elites=4)},
+        {"optimizer": MPPIConfig()},
+        {"optimizer": RandomShootingConfig()},
     ],
     ids=str,
 )
@@ -112,7 +113,7 @@ def test_a_share_is_traced_once_whoever_imagines_it(sharing, monkeypatch):
     monkeypatch.setattr(
         shares, "candidate_returns", lambda *x, **y: traces.append(1) or original(*x, **y)
     )
-    agent = make_agent(initial_std=0.4321, horizon=6)
+    agent = make_agent(optimizer=CEMConfig(initial_std=0.4321), horizon=6)
     actions(agent, steps=4)
     assert len(traces) == 1
 

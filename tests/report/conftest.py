@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import runs
-from headway import settings
+from headway import config as settings
 from headway.config import CollectionConfig, Config
 from headway.training.run import EpisodeRow
 

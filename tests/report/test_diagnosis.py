@@ -8,8 +8,8 @@ import pytest
 import headway
 from headway.cli import main
 from headway.errors import ConfigError, RunError, UnknownNameError
-from headway.experiment.methods import make_config
 from headway.report import diagnosis
+from headway.training.methods import make_config
 from headway.training.run import RunDir
 
 

@@ -310,7 +310,7 @@ def test_the_train_command_makes_the_same_configuration(
     tmp_path, write_run, monkeypatch, own_physics
 ):
     from headway.cli import parse
-    from headway.experiment.methods import make_config
+    from headway.training.methods import make_config
 
     changed = {"model.hidden_sizes": [32, 32], "fitting.bootstrap": True, "planner.horizon": 7,
                "model.backward_net": False}  # fmt: skip

@@ -3,7 +3,6 @@
 import html
 import re
 
-from headway import settings
 from headway.report.page.build import write_report
 from headway.report.page.measures import improvements_of
 from headway.report.page.runs import load_runs
@@ -120,15 +119,6 @@ def test_labels_are_short_and_not_ambiguous(tmp_path, write_run):
     assert {label[-9:] for label in labels} == {f"variant {i}" for i in range(1, 5)}
 
 
-def test_copies_are_found_without_comparing_every_pair(tmp_path, write_run, monkeypatch):
-    for seed in range(6):
-        write_run(tmp_path / f"{seed}", seed=seed)
-    calls, relevant = [], settings.relevant
-    monkeypatch.setattr(settings, "relevant", lambda *c: calls.append(1) or relevant(*c))
-    runs, _ = load_runs([tmp_path])
-    assert len(calls) == len(runs) == 6
-
-
 def test_what_is_tolerated_of_an_environment_makes_no_variant(tmp_path, write_run):
     separate = {"collection.env_processes": True}
     for seed, changed in enumerate([{}, separate, {}]):
@@ -143,9 +133,12 @@ def test_what_is_tolerated_of_an_environment_makes_no_variant(tmp_path, write_ru
 
 def test_settings_that_a_run_cannot_use_make_no_variants(tmp_path, write_run):
     for seed, transitions in ((0, 0), (1, 20)):
-        changed = {"fitting.relation_transitions": transitions, "planner.temperature": 1.0 + seed}
+        changed = {
+            "fitting.relation_transitions": transitions,
+            "planner.optimizer.temperature": 1.0 + seed,
+        }
         write_run(tmp_path / f"seed{seed}", seed=seed, settings_changed=changed)
-    changed = {"planner.temperature": 9.0}
+    changed = {"planner.optimizer.temperature": 9.0}
     write_run(tmp_path / "seed1-again", seed=1, settings_changed=changed)
     runs, notes = load_runs([tmp_path])
     assert series_labels(runs) == ["tmcl", "tmcl"]

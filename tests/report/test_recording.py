@@ -9,11 +9,11 @@ from PIL import Image, ImageColor
 
 from headway import cli
 from headway.errors import BadEnvironmentError, ConfigError
-from headway.experiment.methods import make_config
 from headway.planning.acting import RandomAgent
 from headway.report import film, recording
 from headway.report.style import HEADS, INK
 from headway.training.loading import load_task
+from headway.training.methods import make_config
 from headway.training.run import RunDir
 
 SCENE = (240, 320)

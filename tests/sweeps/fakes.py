@@ -4,10 +4,10 @@ import numpy as np
 
 import runs
 from headway.errors import BusyError, DivergenceError
-from headway.experiment.methods import make_config
 from headway.sweeps.board import Board
 from headway.sweeps.jobs import Job
 from headway.task import sim_param_sets
+from headway.training.methods import make_config
 from headway.training.run import EpisodeRow
 
 TINY = {

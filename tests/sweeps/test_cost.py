@@ -3,11 +3,11 @@
 import fakes
 import pytest
 
-from headway.experiment.methods import make_config
 from headway.planning.flop import plan_flop
 from headway.sweeps.cost import make_plan, run_flop
 from headway.sweeps.jobs import Job
 from headway.training.loading import load_task
+from headway.training.methods import make_config
 
 
 def test_an_estimate_counts_what_is_missing_at_the_speed_of_what_is_done(tmp_path):

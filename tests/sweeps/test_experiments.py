@@ -6,11 +6,11 @@ from pathlib import Path
 import fakes
 import pytest
 
+from headway.config import override
 from headway.errors import ConfigError, RunError, UnknownNameError
-from headway.experiment.methods import METHODS, PRESETS, make_config
-from headway.settings import override
 from headway.sweeps.experiments import EXPERIMENTS, experiment, sweep_experiment
 from headway.sweeps.jobs import Cell, Comparison, Job, fingerprint
+from headway.training.methods import METHODS, PRESETS, make_config
 from headway.training.train import train_run
 
 ENVS = ("cartpole-swingup", "pendulum", "hopper", "slim-humanoid", "half-cheetah", "crippled-ant")

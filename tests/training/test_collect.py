@@ -10,11 +10,11 @@ import misbehaving
 import runs
 from headway.envs.classic import PendulumTask
 from headway.errors import BadEnvironmentError
-from headway.experiment.methods import make_config
 from headway.sim_params import SimParamSets
 from headway.task import EnvSpec, register
 from headway.training.collect import Environments, Episode, random_policy, run_episodes
 from headway.training.evaluate import run_tests
+from headway.training.methods import make_config
 from headway.training.run import RunDir
 from headway.training.train import train_run
 

@@ -7,8 +7,8 @@ import pytest
 
 import headway
 from headway.errors import ConfigError
-from headway.experiment.methods import METHODS
 from headway.task import env_names
+from headway.training.methods import METHODS
 
 TINY = {
     "collection.episode_length": 12,

@@ -18,8 +18,8 @@ import pytest
 
 import runs
 from headway.errors import BadEnvironmentError, LimitError
-from headway.experiment.methods import make_config
 from headway.training import train
+from headway.training.methods import make_config
 from headway.training.progress import Progress
 from headway.training.run import RunDir
 from headway.training.stopping import Terminated

@@ -17,9 +17,11 @@ OBS = np.array([1.0, 0.0, 0.0])
 
 
 def test_a_controller_can_have_another_planner(root):
-    settings = {"planner.num_candidates": 7, "planner.num_elites": 3}
+    settings = {"planner.num_candidates": 7, "planner.optimizer.num_elites": 3}
     planner = headway.load(root, settings=settings).agent.planner
-    wanted = dataclasses.replace(RunDir(root).config().planner, num_candidates=7, num_elites=3)
+    wanted = dataclasses.replace(
+        RunDir(root).config().planner, num_candidates=7, optimizer=CEMConfig(num_elites=3)
+    )
     assert planner == wanted
 
 

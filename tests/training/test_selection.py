@@ -6,14 +6,19 @@ import numpy as np
 import pytest
 
 import toys
-from headway.config import PlannerConfig
+from headway.config import CEMConfig, PlannerConfig
 from headway.data import History, Trajectory
 from headway.models.dynamics import Statistics, network_input
 from headway.planning.agent import Agent
 from headway.training.selection import EpisodeSelection, examine, summarise
 
 TINY = PlannerConfig(
-    horizon=3, num_candidates=8, num_elites=2, num_iterations=1, num_particles=2, selection_length=3
+    horizon=3,
+    num_candidates=8,
+    optimizer=CEMConfig(num_elites=2),
+    num_iterations=1,
+    num_particles=2,
+    selection_length=3,
 )
 
 

@@ -11,11 +11,11 @@ import runs
 from headway.data import Trajectory
 from headway.errors import ConfigError, DivergenceError, PlanningError, UnknownNameError
 from headway.experiment.learners import Learned
-from headway.experiment.methods import make_config
 from headway.models.updates import EpochStats
 from headway.task import env_names
 from headway.training import loading, train
 from headway.training.collect import Environments
+from headway.training.methods import make_config
 from headway.training.run import RunDir
 
 
@@ -93,7 +93,7 @@ def test_episodes_that_end_early_are_learned_from(tmp_path):
     [
         ({}, 2 * 8),
         ({"planner.num_candidates": 6}, 2 * 6),
-        ({"planner.optimizer": "mppi", "planner.num_iterations": 3}, 3 * 8),
+        ({"planner.optimizer.name": "mppi", "planner.num_iterations": 3}, 3 * 8),
     ],
 )
 def test_a_run_can_be_tested_with_another_planner(settings, evaluations, reference):

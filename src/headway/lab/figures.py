@@ -25,7 +25,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
-from headway.experiment.methods import METHODS
 from headway.lab import statistics, tables
 from headway.lab.tables import (
     COLLECTED,
@@ -36,6 +35,7 @@ from headway.lab.tables import (
     value_label,
     varying,
 )
+from headway.training.methods import METHODS
 from headway.training.run import parse_sim_params, write_bytes
 
 INK, FAINT, RULE, GROUND = "#222222", "#7a7a7a", "#e4e4e4", "#f4f4f4"

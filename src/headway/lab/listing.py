@@ -5,15 +5,14 @@ from typing import Any
 
 from rich.table import Table
 
-from headway.config import Config
-from headway.experiment.methods import METHODS, PRESETS
+from headway.config import Config, flatten, to_dict
 from headway.lab.tables import axis_label, new_table, value_label, varying
-from headway.settings import flatten, to_dict
 from headway.sweeps.cost import Plan
 from headway.sweeps.experiments import EXPERIMENTS
 from headway.sweeps.jobs import Comparison
 from headway.sweeps.status import duration
 from headway.task import EnvSpec, env_names, env_spec
+from headway.training.methods import METHODS, PRESETS
 
 Facts = dict[str, Any]
 
@@ -53,7 +52,9 @@ def methods() -> tuple[list[Facts], Table]:
     for method in METHODS.values():
         # What is the same in the paper's preset is set because another preset changes it.
         chosen = {
-            name: value for name, value in flatten(method.settings).items() if value != usual[name]
+            name: value
+            for name, value in flatten(method.settings).items()
+            if value != usual.get(name)
         }
         entries.append(
             {

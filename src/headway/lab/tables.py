@@ -18,8 +18,8 @@ from rich.text import Text
 
 from headway.config import Config
 from headway.errors import RunError
-from headway.experiment.methods import METHODS
 from headway.task import env_names, env_spec
+from headway.training.methods import METHODS
 from headway.training.references import score, score_of
 from headway.training.run import EpisodeRow, parse_sim_params
 

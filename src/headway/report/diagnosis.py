@@ -11,13 +11,13 @@ from rich.table import Table
 from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import ConfigError
-from headway.experiment.methods import config_to_control
 from headway.planning.agent import Agent
 from headway.report.physics import distinct, full_label, varying
 from headway.report.tables import new_table
 from headway.task import sim_param_sets
 from headway.training.evaluate import known_groups, run_tests
 from headway.training.loading import load_agent
+from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
 from headway.training.run import RunDir
 from headway.training.selection import (
@@ -99,7 +99,7 @@ def diagnose(
     """
     run = RunDir(run_dir)
     _check_heads(run)
-    config = config_to_control(run.config(), settings or {})
+    config = config_to_evaluate(run.config(), settings or {}, ("planner",))
     if collected:
         return examined(run, config, _collected(run, groups, num_episodes))
     kept = run.tests() if num_episodes is None else {}

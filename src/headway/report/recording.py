@@ -12,12 +12,12 @@ from headway.config import Config
 from headway.envs import make
 from headway.envs.vector import Schedule
 from headway.errors import BadEnvironmentError, ConfigError
-from headway.experiment.methods import config_to_evaluate
 from headway.planning.controller import Controller
 from headway.report import film
 from headway.report.film import Moment
 from headway.task import env_options, episode_length
 from headway.training.loading import load_agent
+from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
 from headway.training.run import RunDir, write_bytes
 

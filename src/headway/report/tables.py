@@ -8,11 +8,10 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from headway.config import Config
-from headway.experiment.methods import METHODS, PRESETS
+from headway.config import Config, flatten, to_dict
 from headway.report.physics import axis_label, distinct, full_label, value_label, varying
-from headway.settings import flatten, to_dict
 from headway.task import EnvSpec, env_names, env_spec
+from headway.training.methods import METHODS, PRESETS
 from headway.training.references import mean_score, score_of
 from headway.training.run import EpisodeRow
 
@@ -120,7 +119,9 @@ def methods() -> tuple[list[Facts], Table]:
     for method in METHODS.values():
         # What is the same in the paper's preset is set because another preset changes it.
         chosen = {
-            name: value for name, value in flatten(method.settings).items() if value != usual[name]
+            name: value
+            for name, value in flatten(method.settings).items()
+            if value != usual.get(name)
         }
         entries.append(
             {

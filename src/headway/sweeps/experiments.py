@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from headway.errors import ConfigError, UnknownNameError, shown, unknown_name
-from headway.experiment.methods import METHODS
+from headway.training.methods import METHODS
 
 Settings = Mapping[str, Any]
 Measure = Literal["unseen", "collected"]

@@ -11,13 +11,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from headway import settings
-from headway.config import Config
+from headway.config import Config, differences, flatten, to_dict, tolerating_as
 from headway.errors import ConfigError, RunError
-from headway.experiment.methods import make_config
 from headway.sweeps import results_folder
 from headway.sweeps.experiments import Arm, Experiment, Settings
 from headway.task import env_spec
+from headway.training.methods import make_config
 from headway.training.run import RunDir
 
 
@@ -57,8 +56,8 @@ class Job:
         if not (self.path / "config.json").exists():
             return 0
         run = RunDir(self.path)
-        begun_with = settings.tolerating_as(run.config(), self.config)
-        found = settings.differences(begun_with, self.config)
+        begun_with = tolerating_as(run.config(), self.config)
+        found = differences(begun_with, self.config)
         if found:
             raise RunError(
                 f"{self.path} holds a run with other settings ({'; '.join(found)}), perhaps of an"
@@ -160,14 +159,14 @@ def fingerprint(config: Config) -> str:
 
     Only what differs from the defaults counts, so a setting that a later version adds does not
     give the same run another name. What the run cannot use, or only tolerates
-    (`settings.TOLERANCE`), counts as its method and preset have it, whatever it is here: so it
+    (`config.TOLERANCE`), counts as its method and preset have it, whatever it is here: so it
     tells no runs apart, and those of before keep their names.
     """
     names = {"method": config.method, "preset": config.preset, "seed": config.seed}
     usual = make_config(config.env, **names)
-    plain = settings.flatten(settings.to_dict(Config(env=config.env, **names)))
-    tolerating = settings.tolerating_as(config, usual)
-    changed = sorted(_lines(settings.relevant(tolerating, usual)) - _lines(plain))
+    plain = flatten(to_dict(Config(env=config.env, **names)))
+    tolerating = tolerating_as(config, usual)
+    changed = sorted(_lines(flatten(to_dict(tolerating))) - _lines(plain))
     return hashlib.sha256("\n".join(changed).encode()).hexdigest()[:10]
 
 

@@ -20,7 +20,7 @@ import ray
 from ray.exceptions import RayError, RayTaskError, RuntimeEnvSetupError, TaskUnschedulableError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from headway import settings
+from headway.config import from_dict, to_dict
 from headway.errors import ConfigError
 from headway.sweeps.board import Board, first_status
 from headway.sweeps.jobs import Job
@@ -149,7 +149,7 @@ def _mailbox_here() -> Any:
 
 def _work(config: str, path: str, mailbox: Any) -> dict[str, Any]:
     """Train a run in a worker's process; a task takes and returns plain values only."""
-    job = Job(settings.from_dict(json.loads(config)), Path(path))
+    job = Job(from_dict(json.loads(config)), Path(path))
     status = make_run(job, lambda status: mailbox.put.remote(path, dataclasses.asdict(status)))
     return dataclasses.asdict(status)
 
@@ -196,7 +196,7 @@ class _Dispatcher:
     def _submit(self) -> None:
         now = time.monotonic()
         for _, job in [one for one in self._waiting if one[0] <= now]:
-            config = json.dumps(settings.to_dict(job.config))
+            config = json.dumps(to_dict(job.config))
             path = str(job.path.absolute())
             self._running[self._task.remote(config, path, self._mailbox)] = job
         self._waiting = [one for one in self._waiting if one[0] > now]

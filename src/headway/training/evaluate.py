@@ -12,7 +12,6 @@ from jaxtyping import PRNGKeyArray
 from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import unknown_name
-from headway.experiment.methods import config_to_evaluate
 from headway.planning.acting import Acting
 from headway.planning.flop import plan_flop
 from headway.sim_params import SimParamSets
@@ -27,6 +26,7 @@ from headway.training.collect import (
     run_episodes,
 )
 from headway.training.loading import load_agent
+from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
 from headway.training.run import EpisodeRow, Partial, RunDir
 

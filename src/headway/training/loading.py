@@ -5,10 +5,10 @@ import jax
 
 from headway.config import Config
 from headway.experiment.learners import Learned, Learner, make_learner
-from headway.experiment.methods import check_options
 from headway.planning.acting import Acting
 from headway.task import Task, env_options, env_spec, episode_length
 from headway.training.collect import Environments
+from headway.training.methods import check_options
 from headway.training.run import RunDir
 
 

@@ -38,8 +38,7 @@ import numpy as np
 import safetensors.numpy
 from safetensors import SafetensorError, safe_open
 
-from headway import settings
-from headway.config import Config
+from headway.config import Config, differences, from_dict, to_dict, tolerating_as
 from headway.data import Trajectory
 from headway.errors import BusyError, HeadwayError, LimitError, RunError
 
@@ -163,7 +162,7 @@ class RunDir:
     def begin(self, config: Config) -> None:
         """Begin a run here, or make sure that the run here is the same; call it when `locked`.
 
-        What it tolerates of its environments may differ (`settings.TOLERANCE`).
+        What it tolerates of its environments may differ (`config.TOLERANCE`).
 
         Raises:
             RunError: The directory holds a run with other settings, or a damaged one; the
@@ -172,14 +171,14 @@ class RunDir:
         if self._is_new():
             facts = {
                 "schema": SCHEMA,
-                "config": settings.to_dict(config),
+                "config": to_dict(config),
                 "versions": {name: importlib.metadata.version(name) for name in VERSIONED}
                 | {"python": platform.python_version()},
                 "device": str(jax.devices()[0].device_kind),
                 "commit": _commit(),
             }
             write_json(self.path / "config.json", facts)
-        found = settings.differences(settings.tolerating_as(self.config(), config), config)
+        found = differences(tolerating_as(self.config(), config), config)
         if found:
             raise RunError(
                 f"{self.path} holds a run with other settings ({'; '.join(found)}); choose"
@@ -214,7 +213,7 @@ class RunDir:
         """
         values = self.metadata()
         with _reading(self.path / "config.json"):
-            return settings.from_dict(values["config"])
+            return from_dict(values["config"])
 
     @property
     def finished_iterations(self) -> int:

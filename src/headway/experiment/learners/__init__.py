@@ -1,7 +1,6 @@
 """The kinds of models that a run can train, behind one interface; `model.kind` chooses."""
 
-from headway.config import Config
-from headway.config.model import BUILT_IN_KINDS, OWN_KINDS
+from headway.config import BUILT_IN_KINDS, MODELS, Config, ModelConfig, OwnModelConfig
 from headway.errors import ConfigError
 from headway.experiment.learners.adaptive import GradientAdaptation, Recurrence
 from headway.experiment.learners.base import Fit as Fit
@@ -20,7 +19,9 @@ _LEARNERS: dict[str, type[Learner]] = {
 }
 
 
-def register_learner(kind: str, learner: type[Learner]) -> None:
+def register_learner(
+    kind: str, learner: type[Learner], settings: type[ModelConfig] = OwnModelConfig
+) -> None:
     """Add a kind of model of your own; `model.kind` then chooses it.
 
     A program that reads its runs must have registered it too. Runs of it cannot go side by side
@@ -29,6 +30,7 @@ def register_learner(kind: str, learner: type[Learner]) -> None:
     Args:
         kind: Its name.
         learner: How it begins, is fitted and acts.
+        settings: The class of its settings (`headway.config.settings`), whose first is `kind`.
 
     Raises:
         ConfigError: The name is a built-in one, or the class is no `Learner`.
@@ -39,7 +41,7 @@ def register_learner(kind: str, learner: type[Learner]) -> None:
         )
     if not (isinstance(learner, type) and issubclass(learner, Learner)):
         raise ConfigError(f"{learner!r} is no Learner, allowed: a class that inherits from it.")
-    OWN_KINDS.add(kind)
+    MODELS[kind] = settings
     _LEARNERS[kind] = learner
 
 

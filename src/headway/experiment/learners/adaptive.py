@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
+from headway.config import GradientAdaptedConfig
 from headway.data import Trajectory
 from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
 from headway.models.adapted import MetaSetup, ReluNet, meta_epoch
@@ -98,6 +99,7 @@ class GradientAdaptation(Adaptive):
     def setup(self) -> MetaSetup:
         """What fixes the compiled epoch."""
         model = self.config.model
+        assert isinstance(model, GradientAdaptedConfig)
         length, rate = model.adaptation_length, model.adaptation_rate
         return MetaSetup(self.task, self.config.fitting, length, rate)
 

@@ -7,16 +7,15 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from headway.config import Config
+from headway.config import Config, override
 from headway.data import Episodes, Samples, Trajectory
-from headway.experiment.methods import told_sim_params
 from headway.models.dynamics import Statistics
 from headway.models.fitting import FitData, make_data
 from headway.models.updates import EpochStats
 from headway.planning.acting import Acting
-from headway.settings import override
 from headway.task import Task
 from headway.training.collect import Environments
+from headway.training.methods import told_sim_params
 
 
 class Learned(NamedTuple):

@@ -10,13 +10,13 @@ from jaxtyping import Float, PRNGKeyArray
 
 from headway.data import Episodes, Trajectory
 from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
-from headway.experiment.methods import told_sim_params
 from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitSetup, FitState, episode_losses, fit_epoch
 from headway.planning.agent import Agent
 from headway.planning.last_layer.prior import fit_prior
 from headway.training.collect import Environments
 from headway.training.diagnostics import head_shares, prediction_error
+from headway.training.methods import told_sim_params
 
 
 class MultiHeaded(Learner):

@@ -1,7 +1,5 @@
 """From settings to an optimizer."""
 
-import dataclasses
-
 from headway.config import PlannerConfig
 from headway.planning.optimizers.base import Optimizer
 from headway.planning.optimizers.cem import CEM
@@ -18,7 +16,8 @@ _OPTIMIZERS: dict[str, type[Optimizer]] = {
 
 
 def make_optimizer(config: PlannerConfig) -> Optimizer:
-    """Build the optimizer that the settings name; its fields are the settings of those names."""
-    optimizer = _OPTIMIZERS[config.optimizer]
-    fields = dataclasses.fields(optimizer)
-    return optimizer(**{field.name: getattr(config, field.name) for field in fields})
+    """Build the optimizer that the settings name."""
+    own = {name: value for name, value in vars(config.optimizer).items() if name != "name"}
+    return _OPTIMIZERS[config.optimizer.name](
+        num_candidates=config.num_candidates, num_iterations=config.num_iterations, **own
+    )

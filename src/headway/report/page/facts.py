@@ -12,7 +12,7 @@ from headway.report.page.parts import Block, Cell, Line, Panel, Section, Table, 
 from headway.report.page.runs import PHYSICS_FILE, LoadedRun, physics_file, train_command
 from headway.report.page.series import (
     Comparison,
-    used_settings,
+    run_settings,
     value_text,
 )
 from headway.training.run import csv_text
@@ -34,7 +34,7 @@ def settings(comparison: Comparison) -> Section:
 
 def _settings_of(comparison: Comparison, env: str) -> Block:
     series = comparison.series_of(env)
-    tables = [used_settings(comparison.runs_of(env, one)[0]) for one in series]
+    tables = [run_settings(comparison.runs_of(env, one)[0]) for one in series]
     names = [name for name in _disputed(tables) if name not in ("method", "seed")]
     if not names:
         return Block(env, texts=["All runs have the same settings."])

@@ -6,10 +6,9 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from headway import settings
-from headway.config import Config
+from headway.config import TOLERANCE, Config, flatten, to_dict
 from headway.errors import HeadwayError, RunError
-from headway.experiment.methods import make_config
+from headway.training.methods import make_config
 from headway.training.run import EpisodeRow, RunDir
 
 PHYSICS_FILE = "sim_params.json"
@@ -140,12 +139,12 @@ def _newest(rows: list[Row]) -> list[Row]:
 def _without_copies(runs: Sequence[LoadedRun], notes: list[Note]) -> list[LoadedRun]:
     """Leave out runs of the same settings and seed: they would count one seed twice.
 
-    What is tolerated of an environment (`settings.TOLERANCE`) makes no other run.
+    What is tolerated of an environment (`config.TOLERANCE`) makes no other run.
     """
     kept: dict[str, LoadedRun] = {}
     for run in runs:
-        relevant = settings.relevant(run.config)
-        used = {n: value for n, value in relevant.items() if n not in settings.TOLERANCE}
+        relevant = flatten(to_dict(run.config))
+        used = {n: value for n, value in relevant.items() if n not in TOLERANCE}
         same = kept.setdefault(json.dumps(used, sort_keys=True), run)
         if same is not run:
             notes.append(Note(run.path, f"left out: same settings and seed as {same.path}."))
@@ -163,8 +162,8 @@ def train_command(run: LoadedRun) -> list[str]:
     default = _default(config)
     if default is None:
         return words
-    usual = settings.flatten(settings.to_dict(default))
-    for name, value in settings.flatten(settings.to_dict(config)).items():
+    usual = flatten(to_dict(default))
+    for name, value in flatten(to_dict(config)).items():
         if value == usual.get(name) or name.startswith(("sim_params", "env_options")):
             continue
         words += _option(name, value)

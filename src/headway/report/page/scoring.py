@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from headway.config import Config
-from headway.config.unused import OPTIMIZER_SETTINGS
 from headway.report.page.runs import LoadedRun, Note
 from headway.task import env_names, env_options, episode_length
 from headway.training.references import mean_score, normalised, score_of
@@ -155,4 +154,4 @@ def _search(config: Config) -> _Search:
     if config.method == RANDOM:
         return ()
     planner = config.planner
-    return tuple(getattr(planner, n) for n in (*_SEARCH, *OPTIMIZER_SETTINGS[planner.optimizer]))
+    return tuple(getattr(planner, name) for name in _SEARCH)

@@ -5,9 +5,7 @@ import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from headway import settings
-from headway.config.unused import unused_settings
-from headway.experiment.methods import METHODS
+from headway.config import TOLERANCE, flatten, to_dict
 from headway.report.page.runs import LoadedRun, Note
 from headway.report.page.scoring import (
     REFERENCES,
@@ -18,8 +16,9 @@ from headway.report.page.scoring import (
     outcome,
     place_of,
 )
+from headway.training.methods import METHODS
 
-_NAMES = ("env", "method", "seed", *settings.TOLERANCE)  # differ without making a variant
+_NAMES = ("env", "method", "seed", *TOLERANCE)  # differ without making a variant
 _SWATCHES = 8
 _LABEL = 60  # letters of a series' name
 
@@ -201,14 +200,8 @@ def differing_settings(values: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def run_settings(run: LoadedRun) -> dict[str, Any]:
-    """All settings of a run by dotted name; those that it cannot use stand at their defaults."""
-    return settings.relevant(run.config)
-
-
-def used_settings(run: LoadedRun) -> dict[str, Any]:
-    """The settings that make a difference to a run, by dotted name."""
-    unused = unused_settings(run.config)
-    return {name: value for name, value in run_settings(run).items() if name not in unused}
+    """All settings of a run by dotted name."""
+    return flatten(to_dict(run.config))
 
 
 def _settings(run: LoadedRun) -> dict[str, Any]:

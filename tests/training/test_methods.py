@@ -5,10 +5,10 @@ import dataclasses
 import pytest
 
 from headway.errors import ConfigError, UnknownNameError
-from headway.experiment.methods import METHODS, PRESETS, make_config
 from headway.planning.flop import plan_flop
 from headway.task import env_names, env_spec
 from headway.training.evaluate import group_episodes
+from headway.training.methods import METHODS, PRESETS, config_to_evaluate, make_config
 from headway.training.references import score
 from headway.training.run import format_sim_params, parse_sim_params
 
@@ -69,6 +69,18 @@ def test_method_wins_over_preset_and_user_over_both():
         "pendulum", method="vanilla", preset="quick", settings={"planner.num_particles": 4}
     )
     assert changed.planner.num_particles == 4
+
+
+def test_a_test_may_change_only_settings_that_training_did_not_fix():
+    config = make_config("pendulum", method="mcl")
+    changed = config_to_evaluate(config, {"planner.optimizer.name": "mppi", "evaluation.every": 2})
+    assert (changed.planner.optimizer.name, changed.evaluation.every) == ("mppi", 2)
+    for name, sections in (
+        ("model.num_heads", ("planner", "evaluation")),
+        ("evaluation.every", ("planner",)),
+    ):
+        with pytest.raises(ConfigError, match=f"{name} cannot change here, allowed: settings of"):
+            config_to_evaluate(config, {name: 1}, sections)
 
 
 @pytest.mark.parametrize(
