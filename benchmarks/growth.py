@@ -21,7 +21,7 @@ from machine import facts
 from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, NullLocator
 from reporting import LATEST, markdown_table, write_result
 
-from headway.report.style import FAINT, TRAINING, figure, label_axis, legend
+from headway.lab.figures import FAINT, LABELS, figure, legend
 
 POINT_LIMIT = 15.0  # seconds of one call, after which a curve stops
 ENOUGH = 2.0  # seconds of calls that make a median
@@ -90,23 +90,26 @@ def draw(curves: dict[str, Curve], path: Path, machine: str) -> None:
         f"environments, {PLANNER.num_candidates} candidates, horizon {PLANNER.horizon} unless "
         f"varied. {machine}."
     )
-    title, size = "How cost grows", (10.0, 2.3 * rows + 1.0)
+    title, size = "How cost grows", (10.0, 2.3 * rows)
     with figure(path, title=title, caption=caption, size=size) as drawing:
         for i, curve in enumerate(curves.values()):
             axes = drawing.add_subplot(rows, columns, i + 1)
             sizes, seconds = np.array(curve["points"]).T
             linear = seconds[-1] * sizes / sizes[-1]
-            axes.loglog(sizes, seconds, "o-", color=TRAINING, ms=4, label="median of one call")
-            axes.loglog(sizes, linear, "--", color=FAINT, lw=1, label="linear growth")
+            axes.loglog(sizes, seconds, "o-", color=LABELS[0], ms=4)
+            axes.loglog(sizes, linear, "--", color=FAINT, lw=1)
             axes.set_title(f"{curve['what']}, exponent {exponent(curve['points']):.2f}")
-            label_axis(axes, curve["unit"], "seconds" if i % columns == 0 else "")
+            axes.set_xlabel(curve["unit"])
+            axes.set_ylabel("seconds" if i % columns == 0 else "")
             for axis, ends in ((axes.xaxis, sizes), (axes.yaxis, seconds)):
                 wide = max(ends) > 50 * min(ends)
                 axis.set_major_locator(LogLocator(subs=(1,) if wide else (1, 2, 5)))
                 axis.set_minor_locator(NullLocator())
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        legend(drawing)
+        looks = {"median of one call": {"color": LABELS[0], "marker": "o"}}
+        looks["linear growth"] = {"color": FAINT, "linestyle": "--"}
+        legend(drawing, looks)
 
 
 def main() -> None:

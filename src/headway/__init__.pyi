@@ -21,6 +21,12 @@ from .experiment.learners import Fit as Fit
 from .experiment.learners import Learned as Learned
 from .experiment.learners import Learner as Learner
 from .experiment.learners import register_learner as register_learner
+from .lab.diagnose import Diagnosis as Diagnosis
+from .lab.diagnose import diagnose as diagnose
+from .lab.dynamics import plot_dynamics as plot_dynamics
+from .lab.record import Recording as Recording
+from .lab.record import record as record
+from .lab.report import write_report as write_report
 from .models.dynamics import MultiHeadDynamics as MultiHeadDynamics
 from .models.updates import EpochStats as EpochStats
 from .planning.agent import Agent as Agent
@@ -31,12 +37,6 @@ from .planning.optimizers import CEM as CEM
 from .planning.optimizers import ICEM as ICEM
 from .planning.optimizers import MPPI as MPPI
 from .planning.optimizers import RandomShooting as RandomShooting
-from .report.diagnosis import Diagnosis as Diagnosis
-from .report.diagnosis import diagnose as diagnose
-from .report.dynamics import plot_dynamics as plot_dynamics
-from .report.page.build import write_report as write_report
-from .report.recording import Recording as Recording
-from .report.recording import record as record
 from .sim_params import SimParamSets as SimParamSets
 from .task import EnvSpec as EnvSpec
 from .task import Task as Task

@@ -292,13 +292,13 @@ class Evaluate(_OfRun):
 
 @dataclasses.dataclass(frozen=True)
 class Record(_OfRun):
-    """Film an episode of a trained run, with the heads that it plans with; GIF or WebP.
+    """Film an episode of a trained run, with the heads that it plans with; GIF or MP4.
 
     The defaults shown are those of the run named before --help.
     """
 
     output: Output = Path("episode.gif")
-    """The file to write; .gif or .webp."""
+    """The file to write; .gif or .mp4."""
     sim_params: Annotated[tuple[str, ...], _unless_given("drawn from the training physics")] = ()
     """Physics, for example length=1.75."""
     schedule: Annotated[tuple[str, ...], _unless_given("physics stay")] = ()
@@ -320,11 +320,11 @@ class Record(_OfRun):
                 )
             schedule.setdefault(int(found[1]), {}).update(_physics([found[2]], "--schedule"))
         settings = self.changed(self.config())
-        from headway.report import recording
+        from headway.lab.record import record
         from headway.training.run import check_target
 
         check_target(self.output)
-        film = recording.record(
+        film = record(
             self.run_dir,
             self.output,
             sim_params=_physics(self.sim_params, "--sim-params"),
@@ -359,9 +359,9 @@ class Diagnose(_OfRun):
     def run(self, words):
         """Diagnose, and print tables."""
         settings = self.changed(self.config())
-        from headway.report import diagnosis
+        from headway.lab import diagnose as lab
 
-        found = diagnosis.diagnose(
+        found = lab.diagnose(
             self.run_dir,
             groups=self.group or None,
             num_episodes=self.episodes,
@@ -369,7 +369,7 @@ class Diagnose(_OfRun):
             settings=settings,
             progress=self.progress(),
         )
-        return self.show(diagnosis.facts(found), *diagnosis.tables(found))
+        return self.show(lab.facts(found), *lab.tables(found))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -382,16 +382,14 @@ class Report(Command):
     """Run directories, or folders that hold some; any methods, environments and seeds."""
     output: Output = Path("report.html")
     """The HTML file to write."""
-    only: Annotated[tuple[str, ...], _unless_given("all of them")] = ()
-    """Chapters to make, for example `learning-curves` or `contexts`."""
 
     def run(self, words):
         """Write the page, and print where it is."""
-        from headway.report.page.build import write_report
+        from headway.lab.report import write_report
         from headway.training.run import check_target
 
         check_target(self.output)
-        path = str(write_report(self.runs, self.output, only=self.only))
+        path = str(write_report(self.runs, self.output))
         return self.show({"report": path}, path)
 
 
@@ -546,7 +544,7 @@ class PlotDynamics(Command):
         """Draw, and print where the figure is."""
         if self.num_states < 1:
             raise ConfigError(f"--num-states is {self.num_states}, allowed: at least 1.")
-        from headway.report import dynamics
+        from headway.lab import dynamics
         from headway.task import env_spec
         from headway.training.run import check_target
 

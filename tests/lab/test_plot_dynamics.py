@@ -1,7 +1,6 @@
 import numpy as np
 
-from headway.report.dynamics import Changes, choose_views, collect_changes
-from headway.report.obs_names import obs_names
+from headway.lab.dynamics import choose_views, collect_changes, obs_names, plot_dynamics
 from headway.task import env_names, env_spec
 
 
@@ -11,19 +10,22 @@ def test_the_views_are_the_numbers_that_tell_physics_apart():
     varied[..., 2] *= np.array([1.0, 2.0, 4.0])[:, None]
     varied[..., 3] = 2 * varied[..., 2]
     varied[..., 1] = 0.0
-    views = choose_views(Changes([], varied, varied[0]), ["a", "b", "c", "d"])
-    assert [view.label for view in views] == [f"change of {name} in one step" for name in "ca"]
-    assert views[0](varied).shape == (3, 50)
+    assert choose_views(varied) == (2, 0)
 
 
 def test_only_the_physics_differ_between_the_changes():
     spec = env_spec("pendulum")
-    changes = collect_changes(spec, 6, seed=0)
-    assert changes.varied.shape == (4, 6, 3)
-    default = changes.physics.index(dict(spec.default_sim_params))
-    np.testing.assert_allclose(changes.varied[default], changes.default, atol=1e-6)
-    velocity = changes.varied[..., 2]
-    assert (np.ptp(velocity, axis=0) > 0).all()
+    physics = [dict(spec.default_sim_params), *spec.sim_params.group("train")]
+    changes = collect_changes(spec, physics, 6, seed=0)
+    assert changes.shape == (5, 6, 3)
+    same = physics.index(physics[0], 1)
+    np.testing.assert_allclose(changes[same], changes[0], atol=1e-6)
+    assert (np.ptp(changes[1:, :, 2], axis=0) > 0).all()
+
+
+def test_the_figure_is_written(tmp_path):
+    path = plot_dynamics("pendulum", tmp_path / "deep/a.png", num_states=5)
+    assert path.read_bytes().startswith(b"\x89PNG")
 
 
 def test_names_of_observations_fit_the_environments():

@@ -203,7 +203,7 @@ def panel(
         lambda found: f"{found[1]}: {variables.get(found[2], found[2])}",
         svg,
     )
-    svg = re.sub(r'<g id="series-(\d+)">', r'<g class="series-\1">', svg)
+    svg = re.sub(r'<g id="series-(\d+)(?:-\d+)?">', r'<g class="series-\1">', svg)
     svg = re.sub(r'(<\w+) id="', rf'\1 id="{name}-', svg)
     svg = re.sub(r' xlink:href="#', f' href="#{name}-', svg).replace("url(#", f"url(#{name}-")
     svg = re.sub(r" font-family: [^;\"]*;", "", svg)

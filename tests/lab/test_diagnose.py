@@ -8,7 +8,7 @@ import pytest
 import headway
 from headway.cli import main
 from headway.errors import ConfigError, RunError, UnknownNameError
-from headway.report import diagnosis
+from headway.lab import diagnose as lab
 from headway.training.methods import make_config
 from headway.training.run import RunDir
 
@@ -38,7 +38,7 @@ def test_diagnose_runs_the_tests_of_a_run(run_dir, capsys):
         assert inside == sorted(inside)
         assert sum(physics["episodes"] for physics in group["physics"]) == 2
     assert files(run_dir) == before
-    assert diagnosis.facts(headway.diagnose(run_dir))["groups"] == said["groups"]
+    assert lab.facts(headway.diagnose(run_dir))["groups"] == said["groups"]
 
 
 def test_diagnose_collected_episodes(run_dir, capsys):
@@ -103,7 +103,7 @@ def test_the_tests_of_a_run_are_not_run_again(tested, monkeypatch):
         raise AssertionError("tests were run")
 
     with monkeypatch.context() as patched:
-        patched.setattr(diagnosis, "run_tests", never)
+        patched.setattr(lab, "run_tests", never)
         found = headway.diagnose(tested)
         assert {group: len(episodes) for group, episodes in found.episodes.items()} == {
             "train": 3,

@@ -1,0 +1,221 @@
+"""How well a trained run selects heads and knows its own error, as tables and as plain values."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+from rich.table import Table
+
+from headway.config import Config
+from headway.data import Trajectory
+from headway.errors import ConfigError
+from headway.lab.tables import COLLECTED, distinct, full_label, group_label, new_table, varying
+from headway.planning.agent import Agent
+from headway.task import sim_param_sets
+from headway.training.evaluate import known_groups, run_tests
+from headway.training.loading import load_agent
+from headway.training.methods import config_to_evaluate
+from headway.training.progress import Progress
+from headway.training.run import RunDir
+from headway.training.selection import (
+    LEVELS,
+    EpisodeSelection,
+    SelectionSummary,
+    examine,
+    summarise,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """How heads were selected in a run's test episodes."""
+
+    path: Path
+    """The run directory."""
+    config: Config
+    """All settings."""
+    episodes: dict[str, list[EpisodeSelection]]
+    """What all heads predicted, by group and in the order of the episodes."""
+
+    @property
+    def window(self) -> int:
+        """Right selections in a row after which selection has settled: as many as it looks at."""
+        return self.config.planner.selection_length
+
+    def summary(self, group: str) -> SelectionSummary:
+        """The averages of a group."""
+        return summarise(self.episodes[group], self.window)
+
+    def by_physics(self, group: str) -> list[tuple[dict[str, float], SelectionSummary]]:
+        """The averages of each physics of a group, in ascending order."""
+        found = []
+        for physics in distinct(episode.sim_params for episode in self.episodes[group]):
+            same = [e for e in self.episodes[group] if dict(e.sim_params) == physics]
+            found.append((physics, summarise(same, self.window)))
+        return found
+
+
+def diagnose(
+    run_dir: str | Path,
+    *,
+    groups: Sequence[str] | None = None,
+    num_episodes: int | None = None,
+    collected: bool = False,
+    settings: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Examine head selection and predicted variances on a run's own test episodes.
+
+    Before every step of them, all heads predict what it leads to. The episodes are those that the
+    run was tested with after its last iteration. Where it kept none, or another number is
+    asked for, tests are run with the run's protocol. Nothing in the directory changes.
+
+    Args:
+        run_dir: The run directory.
+        groups: `"train"` or unseen groups; all of them by default.
+        num_episodes: Episodes per group to run tests with; by default those of the run are taken.
+        collected: Take the episodes that the last iteration collected instead. The model has
+            learned from these since.
+        settings: Changes of `planner` settings by dotted name: how heads would be selected, and
+            learn, in these same episodes. Actions stay as they were, but for tests that are run.
+        progress: Shown while testing; silent by default.
+
+    Raises:
+        RunError: There is no trained run, or it is damaged.
+        UnknownNameError: No such group.
+        ConfigError: A setting is unknown, of the wrong type or out of range, or one that training
+            has fixed; `collected` leaves no choice of groups and episodes; or the run's method
+            has no model with heads.
+        LimitError: Planning needs more memory than is free.
+    """
+    run = RunDir(run_dir)
+    config = config_to_evaluate(run.config(), settings or {}, ("planner",))
+    if config.model.kind != "multi-headed":
+        raise ConfigError(
+            f"{run.path} is a run of {config.method}, which has no prediction heads, allowed:"
+            " methods with a multi-headed model, such as tmcl."
+        )
+    kept = run.tests() if num_episodes is None and not collected else {}
+    if collected:
+        if groups or num_episodes is not None:
+            raise ConfigError(
+                "groups or episodes are chosen together with `collected`, allowed: one of them; the"
+                " collected episodes are all of training physics."
+            )
+        return examined(run, config, {COLLECTED: run.iteration_data(run.last_iteration)})
+    if kept:
+        wanted = known_groups(groups, sim_param_sets(config).group_names)
+        if kept.keys() >= set(wanted):
+            return examined(run, config, {group: kept[group] for group in wanted})
+    tested = run_tests(
+        run_dir, groups=groups, num_episodes=num_episodes, settings=settings, progress=progress
+    )
+    return examined(run, tested.config, tested.tests.trajectories)
+
+
+def examined(
+    run: RunDir, config: Config, trajectories: Mapping[str, list[Trajectory]]
+) -> Diagnosis:
+    """Examine what a run's heads predict of some episodes, and how they are selected.
+
+    Args:
+        run: The run, of a method with prediction heads.
+        config: Its settings, with those of the planner perhaps changed.
+        trajectories: Episodes of its environment, by group.
+
+    Raises:
+        RunError: There is no trained run, or it is damaged.
+    """
+    agent = load_agent(run, config)
+    assert isinstance(agent, Agent)
+    key = jax.random.key(config.evaluation.seed)
+    episodes = {
+        group: examine(agent, found, key=jax.random.fold_in(key, i))
+        for i, (group, found) in enumerate(trajectories.items())
+    }
+    return Diagnosis(run.path, config, {group: found for group, found in episodes.items() if found})
+
+
+def facts(diagnosis: Diagnosis) -> dict[str, Any]:
+    """The diagnosis as plain values, for JSON."""
+
+    def plain(summary: SelectionSummary) -> dict[str, Any]:
+        names = ("episodes", "chosen_error", "best_error", "average_error", "regret", "settled")
+        calibration = summary.calibration
+        return {
+            **{name: getattr(summary, name) for name in names},
+            "wrong_selections": summary.wrong,
+            "settling_steps": summary.settling,
+            "head_errors": summary.head_errors.tolist(),
+            "calibration": calibration
+            and {
+                "mean_square": calibration.mean_square,
+                "inside": {f"{level:g}": share for level, share in calibration.inside.items()},
+            },
+        }
+
+    groups = []
+    for group in diagnosis.episodes:
+        physics = [{"sim_params": p, **plain(found)} for p, found in diagnosis.by_physics(group)]
+        groups.append({"group": group, **plain(diagnosis.summary(group)), "physics": physics})
+    return {
+        "run_dir": str(diagnosis.path), "settled_after": diagnosis.window, "groups": groups
+    }  # fmt: skip
+
+
+def tables(diagnosis: Diagnosis) -> list[Table]:
+    """Lay a diagnosis out: selection, errors of each head, calibration."""
+    everything = [e.sim_params for episodes in diagnosis.episodes.values() for e in episodes]
+    names = varying(everything)
+    groups = {group: diagnosis.summary(group) for group in diagnosis.episodes}
+    lines = []
+    for group, summary in groups.items():
+        lines.append((_name(group), summary, "bold"))
+        for physics, found in diagnosis.by_physics(group):
+            lines.append((f"  {full_label(physics, names)}", found, ""))
+    numbers = ["episodes", "chosen", "best", "average", "regret", "wrong", "settles", "settled"]
+    selection = new_table(f"Head selection: {diagnosis.path}", "physics", numbers=numbers)
+    for name, summary, style in lines:
+        errors = (summary.chosen_error, summary.best_error, summary.average_error)
+        relative = summary.best_error and f"{summary.regret / summary.best_error:+.1%}"
+        settles = "never" if summary.settling is None else f"{summary.settling:g}"
+        cells = [f"{error:.3g}" for error in errors]
+        cells += [relative or "–", f"{summary.wrong:.0%}", settles, f"{summary.settled:.0%}"]
+        selection.add_row(name, str(summary.episodes), *cells, style=style)
+    selection.caption = (
+        "errors: mean squares in normalised units, of the chosen head, the best one of each episode"
+        " in hindsight, and all heads; regret: chosen above best; wrong: chosen is not the best;"
+        f" settles: transitions seen before the best is chosen {diagnosis.window} times in a row"
+        " (median); settled: share of episodes and members where that happens"
+    )
+    if diagnosis.config.planner.head_selection == "average":
+        selection.caption += ". This run plans with the average; chosen is what it would select."
+    count = max((summary.head_errors.shape[1] for summary in groups.values()), default=0)
+    numbers = [*(f"head {head}" for head in range(count)), "best head"]
+    heads = new_table("Error of each head", "physics", "member", numbers=numbers)
+    for group, summary in groups.items():
+        for member, errors in enumerate(summary.head_errors):
+            cells = [f"{error:.3g}" for error in errors]
+            name = "" if member else _name(group)
+            heads.add_row(name, str(member), *cells, str(errors.argmin()))
+        heads.add_section()
+    heads.caption = "mean squares in normalised units; head numbers of members are unrelated"
+    numbers = ["mean square", *(f"inside {level:.0%}" for level in LEVELS)]
+    title = "Calibration of the predicted variance, chosen heads"
+    calibration = new_table(title, "physics", numbers=numbers)
+    for name, summary, style in lines:
+        if summary.calibration is not None:
+            shares = [f"{summary.calibration.inside[level]:.1%}" for level in LEVELS]
+            mean_square = f"{summary.calibration.mean_square:.3g}"
+            calibration.add_row(name, mean_square, *shares, style=style)
+    calibration.caption = (
+        "mean square: of the error in predicted standard deviations; 1 is right, more is too sure."
+        " inside: share of the truth within the central interval of that level"
+    )
+    return [selection, heads, *[calibration] * bool(calibration.row_count)]
+
+
+def _name(group: str) -> str:
+    return "training, collected" if group == COLLECTED else group_label(group)

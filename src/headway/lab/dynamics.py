@@ -1,0 +1,183 @@
+"""Next states of the same states and actions under different physics (supplement, Fig. 8)."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+
+from headway import envs
+from headway.errors import BadEnvironmentError, ConfigError
+from headway.lab.figures import INK, figure, legend, numbers
+from headway.lab.tables import Physics, full_label, varying
+from headway.task import EnvSpec, env_spec
+
+_HOPPER = ("thigh", "leg", "foot")
+_CHEETAH = ("back thigh", "back shin", "back foot", "front thigh", "front shin", "front foot")
+_HUMANOID = (
+    "abdomen z", "abdomen y", "abdomen x", "right hip x", "right hip z", "right hip y",
+    "right knee", "left hip x", "left hip z", "left hip y", "left knee", "right shoulder 1",
+    "right shoulder 2", "right elbow", "left shoulder 1", "left shoulder 2", "left elbow",
+)  # fmt: skip
+_ANT = tuple(f"{part} {leg}" for leg in range(1, 5) for part in ("hip", "ankle"))
+_LINEAR = tuple(f"{axis} velocity (m/s)" for axis in "xyz")
+_ANGULAR = tuple(f"{axis} angular velocity (rad/s)" for axis in "xyz")
+_QUATERNION = tuple(f"torso quaternion {part}" for part in "wxyz")
+_PLANAR = ("x velocity (m/s)", "z velocity (m/s)", "torso pitch rate (rad/s)")
+
+
+def _joints(names: Sequence[str], *between: str) -> tuple[str, ...]:
+    """Angles of joints, then other numbers, then their rates."""
+    angles = (f"{name} angle (rad)" for name in names)
+    return (*angles, *between, *(f"{name} rate (rad/s)" for name in names))
+
+
+_NAMES: dict[str, tuple[str, ...]] = {
+    "cartpole-swingup": (
+        "cart position (m)", "cart velocity (m/s)", "cos θ", "sin θ", "pole rate (rad/s)",
+    ),
+    "pendulum": ("cos θ", "sin θ", "angular velocity (rad/s)"),
+    "hopper": (
+        "height (m)", "torso pitch (rad)", *_joints(_HOPPER, *_PLANAR), "average x velocity (m/s)",
+    ),
+    "slim-humanoid": ("height (m)", *_QUATERNION, *_joints(_HUMANOID, *_LINEAR, *_ANGULAR)),
+    "half-cheetah": (
+        "average x velocity (m/s)", "height (m)", "torso pitch (rad)", *_joints(_CHEETAH, *_PLANAR),
+    ),
+    "crippled-ant": (
+        "x (m)", "y (m)", "height (m)", *_QUATERNION, *_joints(_ANT, *_LINEAR, *_ANGULAR),
+        *(f"torso rotation ({row}, {column})" for row in range(3) for column in range(3)),
+        "torso x (m)", "torso y (m)", "torso z (m)",
+    ),
+}  # fmt: skip
+
+
+def obs_names(env: str, obs_size: int) -> tuple[str, ...]:
+    """Name each number of an observation; plain numbering where the names are not known.
+
+    Args:
+        env: Short name of the environment.
+        obs_size: Width of its observations; Hopper's last number is an option.
+    """
+    names = _NAMES.get(env, ())
+    if obs_size == len(names) or (env == "hopper" and obs_size == len(names) - 1):
+        return names[:obs_size]
+    return tuple(f"observation[{index}]" for index in range(obs_size))
+
+
+def plot_dynamics(env: str, out: str | Path, *, num_states: int = 100, seed: int = 0) -> Path:
+    """Draw what a trajectory's actions lead to under each training physics.
+
+    A trajectory of random actions is collected in the default environment; in each of its
+    states, the same action is applied under every training physics.
+
+    Args:
+        env: Short name or id of an environment.
+        out: The PNG file to write.
+        num_states: States drawn, evenly spread over the trajectory.
+        seed: Seeds the trajectory and its actions.
+
+    Returns:
+        The file written.
+
+    Raises:
+        UnknownNameError: No such environment.
+        ConfigError: `num_states` is less than 1.
+        BadEnvironmentError: The environment's state cannot be copied.
+    """
+    if num_states < 1:
+        raise ConfigError(f"num_states is {num_states}, allowed: at least 1.")
+    spec = env_spec(env)
+    physics = [dict(spec.default_sim_params), *spec.sim_params.group("train")]
+    changes = collect_changes(spec, physics, num_states, seed)
+    default, varied = changes[0], changes[1:]
+    first, second = choose_views(varied)
+    names = [f"change of {name}" for name in obs_names(spec.name, default.shape[-1])]
+    caption = (
+        f"{spec.name}, {len(default)} states of one trajectory of uniformly random actions under"
+        f" the default physics, seed {seed}. Every state is drawn once per physics, with the same"
+        " action (grey lines join them). The axes are the observation's numbers that differ most"
+        " between physics, measured against their own spread. A straight line through 0 on the"
+        " right means: proportional to the change under default physics."
+    )
+    title = "The same states and actions under different physics"
+    differ = varying(physics[1:])
+    colors = matplotlib.colormaps["plasma"](np.linspace(0.05, 0.85, len(varied)))
+    looks = {
+        full_label(sim_params, differ): {"color": color, "linestyle": "", "marker": "o"}
+        for sim_params, color in zip(physics[1:], colors, strict=True)
+    }
+    looks["default physics"] = {"color": INK, "linestyle": "", "marker": "."}
+    with figure(Path(out), title=title, caption=caption, size=(9.4, 3.6)) as drawing:
+        plane, against = drawing.subplots(1, 2)
+        plane.plot(varied[..., first], varied[..., second], color="#cccccc", linewidth=0.7)
+        for change, style in zip([*varied, default], looks.values(), strict=True):
+            shared: dict[str, Any] = {**style, "markersize": 4, "markeredgewidth": 0}
+            plane.plot(change[:, first], change[:, second], **shared)
+            against.plot(default[:, first], change[:, first], **shared)
+        numbers(plane, x=names[first], y=names[second])
+        numbers(against, x=f"{names[first]}, default physics", y=names[first])
+        for axes in (plane, against):
+            axes.grid(visible=True, axis="both")
+        legend(drawing, looks)
+    return Path(out)
+
+
+def collect_changes(
+    spec: EnvSpec, physics: Sequence[Physics], num_states: int, seed: int
+) -> Float[np.ndarray, "physics state obs"]:
+    """Collect a trajectory under the first physics, and changes of observations under all.
+
+    Args:
+        spec: The environment.
+        physics: What each of the trajectory's actions is applied under.
+        num_states: States to compare, evenly spread over one trajectory.
+        seed: Seeds the trajectory and its actions.
+
+    Raises:
+        BadEnvironmentError: The environment's state cannot be copied.
+    """
+    environment = envs.make(spec.name)
+    world: Any = environment.unwrapped
+    for method in ("get_state", "set_state", "set_sim_params", "observation"):
+        if not hasattr(world, method):
+            raise BadEnvironmentError(
+                f"{spec.name} has no method {method}, allowed: environments with get_state,"
+                " set_state, set_sim_params and observation; add them to draw its dynamics."
+            )
+    world.action_space.seed(seed)
+    world.reset(seed=seed, options={"sim_params": dict(physics[0])})
+    trajectory = []
+    for _ in range(spec.episode_length):
+        trajectory.append((world.get_state(), world.action_space.sample()))
+        if world.step(trajectory[-1][1])[2]:
+            break
+    steps = np.linspace(0, len(trajectory) - 1, min(num_states, len(trajectory)), dtype=int)
+    changes = []
+    for sim_params in physics:
+        world.set_sim_params(sim_params)
+        for step in steps:
+            state, action = trajectory[step]
+            world.set_state(state)
+            before = np.asarray(world.observation(), np.float64)
+            changes.append(np.asarray(world.step(action)[0], np.float64) - before)
+    environment.close()
+    return np.stack(changes).reshape(len(physics), len(steps), -1)
+
+
+def choose_views(changes: Float[np.ndarray, "physics state obs"]) -> tuple[int, int]:
+    """Choose the two numbers of the observation that tell the physics apart best.
+
+    For each number, the spread between physics (of the same state and action) is measured
+    against its whole spread over states and physics. The second is the best one that is not
+    nearly a copy of the first.
+    """
+    whole, between = changes.std((0, 1)), changes.std(0).mean(0)
+    share = np.where(whole > 1e-9, between / np.maximum(whole, 1e-9), 0.0)
+    first, *others = (int(i) for i in np.argsort(-share, kind="stable"))
+    flat = changes.reshape(-1, changes.shape[-1])
+    others = [i for i in others if whole[i] > 1e-9]
+    apart = [i for i in others if abs(np.corrcoef(flat[:, first], flat[:, i])[0, 1]) < 0.95]
+    return first, (apart or others or [first])[0]

@@ -1,1 +1,0 @@
-"""What a run looks like: figures and tables made from its files."""

@@ -1,1 +1,0 @@
-"""One page that compares runs: methods against environments, over seeds."""

@@ -1,0 +1,165 @@
+"""The report: what it says, that it needs nothing else, and how it looks in a browser."""
+
+import base64
+import csv
+import html
+import io
+import re
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from headway.errors import ConfigError
+from headway.lab.report import write_report
+
+CHAPTERS = [
+    "results", "learning-curves", "physics", "improvement", "head-shares", "prediction-error",
+    "settings", "times", "runs", "numbers",
+]  # fmt: skip
+TABLES = ("metrics.jsonl", "evaluation.csv", "assignments.csv", "prediction_error.csv")
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "google-chrome"))), None
+)
+HOSTILE = '<script>alert("1")</script>&amp;$x_{2}$'
+
+
+def text_of(page):
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", page)).split())
+
+
+def section(page, name):
+    return re.search(rf'<section id="{name}">.*?</section>', page, re.DOTALL)[0]
+
+
+def numbers(page):
+    content = re.search(r'href="data:text/csv;charset=utf-8;base64,([^"]*)"', page)[1]
+    return list(csv.DictReader(io.StringIO(base64.b64decode(content).decode())))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory, write_run):
+    """A page of two methods over three seeds with both references, and an unfinished run."""
+    root = tmp_path_factory.mktemp("report")
+    lifts = {"tmcl": 0.0, "pets": -150.0, "random": -900.0, "true-dynamics": 300.0}
+    for method, lift in lifts.items():
+        for seed in range(3):
+            write_run(root / f"runs/{method}-{seed}", method=method, seed=seed, lift=lift)
+    unfinished = write_run(root / "runs/tmcl-3", seed=3) / "metrics.jsonl"
+    unfinished.write_text("".join(unfinished.read_text().splitlines(keepends=True)[:3]))
+    return write_report([root / "runs"], root / "report.html")
+
+
+def test_the_page_holds_every_chapter_and_needs_nothing_else(made):
+    page = made.read_text()
+    assert re.findall(r'<section id="([\w-]+)">', page) == CHAPTERS
+    for name in ("learning-curves", "physics", "head-shares", "prediction-error"):
+        assert "<path" in section(page, name)
+    assert not re.findall(r'(?:src|href)="(?!#|data:)', page)
+    assert not re.findall(r"@import|url\((?!#)(?!\"?#)", page)
+    assert "<script" not in page
+    ids = re.findall(r' id="([^"]+)"', page)
+    for target in re.findall(r'(?:href="|url\()#([^")]+)', page):
+        assert target in ids
+    assert f"headway report {made.parent / 'runs'} -o {made}" in text_of(page)
+
+
+def test_results_and_claims_are_those_of_the_numbers(made):
+    page = made.read_text()
+    rows = numbers(page)
+    assert len(rows) == 4 * 3 * 8
+    low = [r for r in rows if (r["method"], r["group"]) == ("tmcl", "low")]
+    scores = [np.mean([float(r["score"]) for r in low if r["seed"] == s]) for s in "012"]
+    results = text_of(section(page, "results"))
+    assert f"{np.mean(scores):.2f}" in results
+    assert "normalised by the runs of random and true-dynamics given here" in results
+    assert "fewer than 10 seeds are too narrow" in results
+    said = "3 seeds: too few to show that tmcl and pets differ (the clearest result has p = 0.1)"
+    assert f"{said}; tmcl is above pets in every pair of runs." in text_of(page)
+    assert "3 of 5 iterations are finished" in text_of(page)
+
+
+def test_few_seeds_have_no_interval_and_no_claim(tmp_path, write_run):
+    for method in ("tmcl", "pets"):
+        write_run(tmp_path / f"runs/{method}", method=method, lift=len(method))
+    page = write_report([tmp_path / "runs"], tmp_path / "report.html").read_text()
+    results = text_of(section(page, "results"))
+    assert "Fewer than 3 finished seeds: tmcl on pendulum (1); pets on pendulum (1)." in results
+    assert not re.search(r"\d to [−\d]", results)
+    assert "is better than" not in page
+
+
+def test_damage_costs_one_line_and_no_chapter(tmp_path, write_run):
+    for seed in (0, 1):
+        write_run(tmp_path / f"runs/tmcl-{seed}", seed=seed)
+    for name in TABLES:
+        (tmp_path / "runs/tmcl-1" / name).write_bytes(b"\xff no\n")
+    page = write_report([tmp_path / "runs"], tmp_path / "report.html").read_text()
+    notes = re.findall(r"<li><code>(.*?)</code> (.*?)</li>", page)
+    assert {run for run, _ in notes} == {str(tmp_path / "runs/tmcl-1")}
+    assert re.findall(r'<section id="([\w-]+)">', page) == CHAPTERS
+
+
+def test_nothing_finished_has_every_chapter(tmp_path, write_run):
+    path = write_run(tmp_path / "run")
+    for name in TABLES:
+        (path / name).unlink()
+    page = write_report([path], tmp_path / "report.html").read_text()
+    assert "No run is finished yet." in page
+    assert re.findall(r'<section id="([\w-]+)">', page) == CHAPTERS
+    with pytest.raises(ConfigError, match="no run is given"):
+        write_report([], tmp_path / "report.html")
+
+
+def test_several_environments_are_taken_together(tmp_path, write_run):
+    for env in ("pendulum", "own"):
+        for method in ("tmcl", "random", "true-dynamics"):
+            lift = {"random": -900, "true-dynamics": 300}.get(method, 0)
+            write_run(tmp_path / f"runs/{env}-{method}", env=env, method=method, lift=lift)
+    page = write_report([tmp_path / "runs"], tmp_path / "report.html").read_text()
+    assert "All environments" in section(page, "results")
+    assert page.count("<h3>own</h3>") == page.count("<h3>pendulum</h3>") > 1
+
+
+def test_names_with_html_are_only_text(tmp_path, write_run):
+    path = write_run(tmp_path / "a<b>&'c", method=HOSTILE, env=HOSTILE)
+    for table in ("evaluation.csv", "prediction_error.csv"):
+        text = (path / table).read_text().replace(",low,", ',"' + HOSTILE.replace('"', '""') + '",')
+        (path / table).write_text(text)
+    page = write_report([path], tmp_path / "report.html").read_text()
+    assert "<script" not in page
+    assert "<b>" not in page
+    assert HOSTILE in html.unescape(page)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    api = pytest.importorskip("playwright.sync_api", reason="no Playwright: pip install playwright")
+    if CHROMIUM is None:
+        pytest.skip("no Chromium here: apt-get install chromium-headless-shell")
+    with api.sync_playwright() as playwright:
+        launched = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield launched
+        launched.close()
+
+
+@pytest.mark.parametrize(("scheme", "width"), [("light", 1280), ("dark", 360)])
+def test_the_page_in_a_browser(browser, made, scheme, width):
+    page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
+    page.set_default_timeout(120_000)
+    errors = []
+    page.on("console", lambda message: errors.append(message.text))
+    page.on("pageerror", errors.append)
+    page.on("request", lambda request: errors.append(request.url))
+    page.goto(made.as_uri())
+    assert [error for error in errors if not error.startswith("data:")] == [made.as_uri()]
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
+    paper = {"light": (255, 255, 255), "dark": (0x17, 0x18, 0x1C)}[scheme]
+    assert tuple(picture[5, 5]) == paper
+    line = page.locator("#results .series-1").first
+    assert line.is_visible()
+    page.locator("#show-1").uncheck()
+    assert not line.is_visible()
+    page.close()
