@@ -10,8 +10,8 @@ from workloads import EPISODE_LENGTH, make_agent, make_fit, make_trajectories
 from headway.config import CEMConfig, FittingConfig, MultiHeadedConfig, PlannerConfig
 from headway.data import Episodes, Samples
 from headway.models.compilation import jit_networks
-from headway.models.dynamics import Statistics
 from headway.models.fitting import assign_segments, fit_epoch, make_data
+from headway.models.multi_headed import Statistics
 from headway.task import env_spec
 
 MODEL = MultiHeadedConfig(

@@ -100,13 +100,13 @@ def tiny_agent():
 def count_traces() -> list[int]:
     """Grows with every trace of a step."""
     traces: list[int] = []
-    original = agent_module.encode
+    original = agent_module.observe
 
     def encode(*parts):
         traces.append(1)
         return original(*parts)
 
-    agent_module.encode = encode
+    agent_module.observe = encode
     return traces
 
 

@@ -7,9 +7,10 @@ import numpy as np
 
 from headway.config import FittingConfig, MultiHeadedConfig, PlannerConfig
 from headway.data import Episodes, Samples, Trajectory
-from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitData, FitSetup, FitState, make_data
+from headway.models.multi_headed import MultiHeadDynamics, Statistics
 from headway.planning.agent import Agent, AgentState
+from headway.planning.heads import MultiHeadModel
 from headway.planning.last_layer.regression import Prior
 from headway.task import Task, env_spec
 
@@ -27,7 +28,8 @@ def make_agent(
     task = env_spec("half-cheetah").make_task()
     dynamics = MultiHeadDynamics.init(model, task, key=jax.random.key(0))
     statistics = Statistics.identity(task, model.history_length)
-    agent = Agent(dynamics, statistics, task, planner, model.history_length, prior)
+    acting = MultiHeadModel(dynamics, statistics, task, planner, model.history_length, prior)
+    agent = Agent(acting, task, planner)
     obs = 0.1 * jax.random.normal(jax.random.key(1), (num_envs, task.obs_size))
     return agent, agent.init(num_envs, key=jax.random.key(2)), obs
 

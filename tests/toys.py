@@ -8,8 +8,11 @@ import numpy as np
 
 from headway.config import MultiHeadedConfig
 from headway.data import Episodes, Samples, Trajectory
-from headway.models.dynamics import GaussianNet, MultiHeadDynamics, Statistics
+from headway.models.multi_headed import GaussianNet, MultiHeadDynamics, Statistics
 from headway.models.networks import Dense, DenseHeads
+from headway.planning.agent import Agent
+from headway.planning.heads import MultiHeadModel
+from headway.planning.optimizers import where_env
 from headway.task import Task
 
 
@@ -108,6 +111,19 @@ def linear_model(gains):
     weight = jnp.asarray(np.concatenate([full, -full], axis=2), jnp.float32)
     mean_heads = DenseHeads(weight, jnp.zeros((members, heads, obs_size)))
     return MultiHeadDynamics(GaussianNet((hidden,), mean_heads, None, None, None), None, None)
+
+
+def make_agent(net, planner, *, statistics=None, task=POINT, history_length=3, prior=None):
+    """An agent that acts with some networks."""
+    statistics = statistics or identity_statistics(task)
+    model = MultiHeadModel(net, statistics, task, planner, history_length, prior)
+    return Agent(model, task, planner)
+
+
+def reset_where(state, fresh, done):
+    """Begin a new episode in some environments."""
+    kept = where_env(done, fresh._replace(key=None), state._replace(key=None))
+    return kept._replace(key=state.key)
 
 
 def identity_statistics(task=POINT, history_length=3):

@@ -24,7 +24,7 @@ from headway.experiment.learners import Learned, make_learner
 from headway.experiment.learners import multi_headed as learners
 from headway.experiment.loading import load_learned, load_task
 from headway.experiment.training import Keys
-from headway.models.dynamics import MultiHeadDynamics, Statistics
+from headway.models.multi_headed import MultiHeadDynamics, Statistics
 from headway.planning.last_layer import training
 from headway.planning.last_layer.regression import see_episode
 from headway.storage.records import write_csv

@@ -20,7 +20,7 @@ from go_on import copy_but_last_fit, finish
 from jaxtyping import Float, Int
 
 from headway.experiment.learners import Learned
-from headway.models.dynamics import MultiHeadDynamics
+from headway.models.multi_headed import MultiHeadDynamics
 from headway.training.loading import load_learned
 from headway.training.run import RunDir
 

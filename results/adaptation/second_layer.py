@@ -27,7 +27,7 @@ from headway.config import Config
 from headway.data import Episodes, Trajectory
 from headway.experiment.learners import Learned
 from headway.experiment.loading import load_learned, load_task
-from headway.models.dynamics import MultiHeadDynamics
+from headway.models.multi_headed import MultiHeadDynamics
 from headway.planning.last_layer.evidence import Evidence
 from headway.planning.last_layer.regression import Seen, see_episode
 from headway.storage.records import write_csv

@@ -27,12 +27,11 @@ from .lab.dynamics import plot_dynamics as plot_dynamics
 from .lab.record import Recording as Recording
 from .lab.record import record as record
 from .lab.report import write_report as write_report
-from .models.dynamics import MultiHeadDynamics as MultiHeadDynamics
+from .models.base import FunctionModel as FunctionModel
+from .models.multi_headed import MultiHeadDynamics as MultiHeadDynamics
 from .models.updates import EpochStats as EpochStats
 from .planning.agent import Agent as Agent
 from .planning.controller import Controller as Controller
-from .planning.meta.agent import AdaptiveAgent as AdaptiveAgent
-from .planning.meta.function import FunctionModel as FunctionModel
 from .planning.optimizers import CEM as CEM
 from .planning.optimizers import ICEM as ICEM
 from .planning.optimizers import MPPI as MPPI

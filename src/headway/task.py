@@ -100,6 +100,23 @@ class Task(eqx.Module):
         return eqx.filter_eval_shape(self.preprocess, np.zeros(self.obs_size, np.float32)).shape[-1]
 
 
+def env_action(
+    task: Task, action: Float[np.ndarray, "*batch action"]
+) -> Float[np.ndarray, "*batch action"]:
+    """`Task.scale_action` in NumPy, exactly within the environment's bounds."""
+    low, high = np.asarray(task.action_low), np.asarray(task.action_high)
+    scaled = low + 0.5 * (action.astype(np.float64) + 1.0) * (high - low)
+    return np.clip(scaled, low, high).astype(np.float32)
+
+
+def scaled_action(
+    task: Task, action: Float[np.ndarray, "*batch action"]
+) -> Float[np.ndarray, "*batch action"]:
+    """`Task.unscale_action` in NumPy."""
+    low, high = np.asarray(task.action_low), np.asarray(task.action_high)
+    return (2.0 * (action.astype(np.float64) - low) / (high - low) - 1.0).astype(np.float32)
+
+
 @dataclasses.dataclass(frozen=True)
 class EnvSpec:
     """Name, physics and scale of an environment, and how its Task is made.

@@ -9,7 +9,7 @@ import headway
 import headway.envs
 from headway.config import differences
 from headway.data import Trajectory
-from headway.models.dynamics import network_input
+from headway.models.multi_headed import network_input
 from headway.training import loading, train
 from headway.training.methods import make_config, told_sim_params
 

@@ -6,18 +6,14 @@ import numpy as np
 import pytest
 
 import headway
-from headway.envs.built_in import ClassicVectorEnv, RobotVectorEnv
+from headway.envs.built_in import ClassicVectorEnv
 from headway.errors import ConfigError
-from headway.experiment.true_dynamics import (
-    ClassicDynamics,
-    RobotSimulator,
-    make_simulator,
-)
 from headway.lab.figures import save_run_figures
-from headway.planning.controller import env_action
-from headway.planning.returns import RolloutSettings, candidate_returns
-from headway.task import env_names, env_spec
+from headway.models.simulator import ClassicSimulator, RobotSimulator
+from headway.planning.rollouts import candidate_returns
+from headway.task import env_action, env_names, env_spec
 from headway.training.collect import Environments
+from headway.training.loading import initial, learner_of
 from headway.training.methods import make_config
 
 CLASSIC = ["pendulum", "cartpole-swingup"]
@@ -77,33 +73,51 @@ def test_compiled_equations_step_as_the_environment_under_every_physics(env):
         np.testing.assert_allclose(vector.world.observe(found, jnp), obs, rtol=3e-6, atol=3e-5)
 
 
+def agent_of(config, environments):
+    learner = learner_of(config, environments.task)
+    return learner.agent(initial(config, environments.task), environments)
+
+
+def simulator_of(config, environments):
+    """The model that plans in some environments, and what it believes of them."""
+    model = agent_of(config, environments).model
+    assert isinstance(model, ClassicSimulator | RobotSimulator)
+    return model, model.init_belief(environments.vector.num_envs)
+
+
 @pytest.mark.parametrize("env", CLASSIC)
 def test_imagined_returns_of_the_equations_are_what_the_environment_pays(env):
     config, environments = begin(env, every_physics(env))
-    vector, task = environments.vector, environments.task
-    assert isinstance(vector, ClassicVectorEnv)
-    sequences = np.random.default_rng(1).uniform(-1, 1, (vector.num_envs, 3, 9, 1))
+    model, belief = simulator_of(config, environments)
+    sequences = np.random.default_rng(1).uniform(-1, 1, (environments.vector.num_envs, 3, 9, 1))
     candidates = jnp.asarray(sequences, jnp.float32)
-    states = jnp.asarray(vector.states, jnp.float32)
-    sim_params = {k: jnp.asarray(v, jnp.float32) for k, v in vector.sim_params.items()}
-    found = candidate_returns(
-        ClassicDynamics(states, sim_params, vector.world),
-        task,
-        vector.world.observe(states, jnp),
-        candidates,
-        settings=RolloutSettings.of(config.planner, 1),
-        key=jax.random.key(0),
-    )
+    obs = model.vector.world.observe(jnp.asarray(belief.state), jnp)
+    args = model.dynamics(belief), environments.task, obs, candidates
+    found = candidate_returns(*args, planner=config.planner, key=jax.random.key(0))
     paid = play(environments, np.asarray(candidates[:, 1]))
     np.testing.assert_allclose(found[:, 1], paid, rtol=1e-4)
     assert np.abs(found[:, 0] - paid).min() > 1e-4
 
 
+def test_a_step_plans_from_where_the_environments_are_now():
+    config, environments = begin("pendulum", every_physics("pendulum")[:2])
+    agent = learner_of(config, environments.task).agent(
+        initial(config, environments.task), environments
+    )
+    state = agent.init(2, key=jax.random.key(0))
+    for _ in range(2):
+        obs = environments.vector.step(np.ones((2, 1), np.float32))[0]
+        state, _ = agent.act(state, obs)
+        np.testing.assert_allclose(state.belief.state, environments.vector.states, rtol=1e-6)
+        np.testing.assert_allclose(
+            state.belief.sim_params["length"], environments.vector.sim_params["length"]
+        )
+
+
 @pytest.mark.parametrize("env", ROBOTS)
 def test_imagined_returns_of_robots_are_what_the_environment_pays_to_the_bit(env):
     config, environments = begin(env, every_physics(env))
-    simulator = make_simulator(environments, config.planner)
-    assert isinstance(simulator, RobotSimulator)
+    simulator, _ = simulator_of(config, environments)
     shape = (environments.vector.num_envs, 3, 6, environments.task.action_size)
     candidates = np.random.default_rng(1).uniform(-1, 1, shape).astype(np.float32)
     found = np.asarray(simulator.returns(candidates))
@@ -116,10 +130,8 @@ def test_imagined_returns_of_robots_are_what_the_environment_pays_to_the_bit(env
 
 def test_a_robot_that_mujoco_gives_up_on_ranks_last():
     config, environments = begin("half-cheetah", every_physics("half-cheetah")[:1])
-    vector = environments.vector
-    assert isinstance(vector, RobotVectorEnv)
-    vector.datas[0].qpos[4] = 1e12  # beyond what MuJoCo accepts
-    simulator = make_simulator(environments, config.planner)
+    environments.vector.datas[0].qpos[4] = 1e12  # beyond what MuJoCo accepts
+    simulator, _ = simulator_of(config, environments)
     candidates = np.zeros((1, 2, 4, environments.task.action_size), np.float32)
     assert not np.isfinite(simulator.returns(candidates)).any()
 

@@ -16,7 +16,6 @@ import pytest
 from headway.config import FittingConfig
 from headway.data import History, segment_sums
 from headway.envs.locomotion import HalfCheetahTask
-from headway.models.dynamics import ContextEncoder, GaussianNet, MultiHeadDynamics, Statistics
 from headway.models.fitting import Assignment, Batch, head_losses, total_loss
 from headway.models.losses import (
     assign_heads,
@@ -25,6 +24,7 @@ from headway.models.losses import (
     oracle_loss,
     weight_decay_loss,
 )
+from headway.models.multi_headed import ContextEncoder, GaussianNet, MultiHeadDynamics, Statistics
 from headway.models.networks import Dense, DenseHeads, Normalizer
 
 SEGMENT = 10

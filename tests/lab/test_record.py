@@ -9,12 +9,13 @@ import pytest
 from PIL import Image, ImageColor
 
 from headway import cli
+from headway.config import PlannerConfig
 from headway.envs import make
 from headway.errors import BadEnvironmentError, ConfigError
 from headway.lab import record as lab
 from headway.lab.figures import HEADS, INK
 from headway.lab.record import MARGIN, WIDTH, Recording, film
-from headway.planning.acting import RandomAgent
+from headway.planning.agent import Agent
 from headway.training.loading import load_task
 from headway.training.methods import make_config
 from headway.training.run import RunDir
@@ -96,7 +97,9 @@ def test_without_heads_there_are_no_strips():
 @pytest.fixture
 def run_dir(tmp_path, monkeypatch):
     """A run whose agent acts at random."""
-    monkeypatch.setattr(lab, "load_agent", lambda run, config: RandomAgent(load_task(config)))
+    monkeypatch.setattr(
+        lab, "load_agent", lambda run, config: Agent(None, load_task(config), PlannerConfig())
+    )
     run = RunDir(tmp_path / "run")
     run.begin(make_config("pendulum", preset="smoke"))
     return run.path

@@ -6,8 +6,8 @@ import numpy as np
 
 import toys
 from headway.config import FittingConfig, GradientAdaptedConfig
-from headway.models.adapted import Window
 from headway.models.fitting import make_data
+from headway.models.grbal import Window
 
 TINY = GradientAdaptedConfig(hidden_sizes=(5,))
 

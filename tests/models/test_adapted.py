@@ -10,7 +10,7 @@ from adaptive_helpers import TINY, random_window, toy_data
 
 import toys
 from headway.config import FittingConfig
-from headway.models.adapted import (
+from headway.models.grbal import (
     MetaSetup,
     ReluNet,
     Window,

@@ -11,7 +11,7 @@ import toys
 from headway.config import MultiHeadedConfig
 from headway.data import Episodes, History
 from headway.errors import ConfigError
-from headway.models.dynamics import MultiHeadDynamics, Statistics, context_size
+from headway.models.multi_headed import MultiHeadDynamics, Statistics, context_size
 
 PLACES = ["input", "last-hidden", "head"]
 KINDS = ["learned", "history", "sim-params"]

@@ -9,7 +9,7 @@ import pytest
 
 import toys
 from headway.data import History
-from headway.models.dynamics import MultiHeadDynamics, Statistics, network_input
+from headway.models.multi_headed import MultiHeadDynamics, Statistics, network_input
 
 TASK = toys.ScaledTask()
 SWITCHES = [{}, {"context_size": 0}, {"backward_net": False}, {"deterministic": True}]

@@ -11,8 +11,8 @@ import toys
 from headway.config import FittingConfig, MultiHeadedConfig
 from headway.data import Trajectory
 from headway.models import fitting
-from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitSetup, assign_segments, fit_epoch, make_data
+from headway.models.multi_headed import MultiHeadDynamics, Statistics
 
 LINEAR = MultiHeadedConfig(
     num_members=2, num_heads=2, hidden_sizes=(16,), context_size=0, backward_net=False

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 import toys
 from headway.config import FittingConfig
 from headway.data import segment_sums
-from headway.models.dynamics import Prediction
 from headway.models.fitting import Assignment, Batch, head_losses, total_loss
 from headway.models.losses import (
     HEAD_DECAY,
@@ -23,6 +22,7 @@ from headway.models.losses import (
     oracle_loss,
     weight_decay_loss,
 )
+from headway.models.multi_headed import Prediction
 from headway.models.networks import bound_logvar
 
 REDUCTIONS = ["head", "segment"]

@@ -12,8 +12,8 @@ from headway.config import FittingConfig, MultiHeadedConfig
 from headway.errors import ConfigError
 from headway.models import compilation, fitting
 from headway.models.compilation import in_each_precision
-from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitSetup, episode_losses, fit_epoch, make_data
+from headway.models.multi_headed import MultiHeadDynamics, Statistics
 from headway.models.products import affine, rounded
 from headway.training.methods import make_config
 

@@ -7,8 +7,8 @@ from adaptive_helpers import random_window, toy_data
 
 import toys
 from headway.config import FittingConfig, RecurrentConfig
-from headway.models.adapted import Window
-from headway.models.recurrent import (
+from headway.models.grbal import Window
+from headway.models.rebal import (
     RecurrentNet,
     RecurrentSetup,
     batch_gradient,

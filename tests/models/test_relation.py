@@ -12,9 +12,9 @@ import toys
 from headway.config import FittingConfig
 from headway.data import History
 from headway.models.batches import Batch
-from headway.models.dynamics import MultiHeadDynamics, Statistics, network_input
 from headway.models.fitting import FitSetup, fit_epoch, gather_batch, make_data, update
 from headway.models.losses import HIDDEN_DECAY
+from headway.models.multi_headed import MultiHeadDynamics, Statistics, network_input
 from headway.models.relation import (
     Pairs,
     intervene,

@@ -10,8 +10,7 @@ import pytest
 import toys
 from headway.config import CEMConfig, PlannerConfig
 from headway.errors import ConfigError
-from headway.models.dynamics import MultiHeadDynamics
-from headway.planning.agent import Agent, reset_where
+from headway.models.multi_headed import MultiHeadDynamics
 from headway.planning.last_layer.learning import Learned
 from headway.planning.last_layer.prior import fit_prior
 from headway.planning.last_layer.regression import Prior
@@ -35,7 +34,7 @@ POINT_PRIOR = Prior(jnp.full(2, 1e4), jnp.full((2, 2), 1e-4))
 
 def make_agent(model=WRONG, prior=POINT_PRIOR, **settings):
     planner = dataclasses.replace(LAST_LAYER, **settings)
-    return Agent(model, toys.identity_statistics(), toys.POINT, planner, 3, prior)
+    return toys.make_agent(model, planner, prior=prior)
 
 
 def play(agent, gain, steps, *, state=None, spike=None, first_random=0):
@@ -54,7 +53,10 @@ def play(agent, gain, steps, *, state=None, spike=None, first_random=0):
 
 def predicted_gain(agent, state):
     """What the chosen head now says that a push of 1 does, per env and member."""
-    weight = agent.model.forward_net.mean_heads.weight + state.learned.layer.weight[..., :-1, :]
+    weight = (
+        agent.model.net.forward_net.mean_heads.weight
+        + state.belief.learned.layer.weight[..., :-1, :]
+    )
     obs_size = agent.task.obs_size
     size = obs_size + agent.task.action_size
     slope = 0.5 * (weight[:, :, 0, obs_size] - weight[:, :, 0, size + obs_size])
@@ -66,10 +68,12 @@ def test_the_heads_learn_the_episodes_physics_and_forget_them_with_it():
     state, _ = play(agent, 1.0, 15, first_random=15)
     np.testing.assert_allclose(predicted_gain(agent, state), 1.0, atol=0.05)
     start = agent.init(2, key=jax.random.key(1))
-    reset = reset_where(state, start, jnp.asarray([True, False]))
+    reset = toys.reset_where(state, start, jnp.asarray([True, False]))
     np.testing.assert_allclose(predicted_gain(agent, reset)[0], [0.4, 0.3], atol=1e-6)
     np.testing.assert_allclose(predicted_gain(agent, reset)[1], 1.0, atol=0.05)
-    np.testing.assert_array_equal(reset.learned.layer.root[0], start.learned.layer.root[0])
+    np.testing.assert_array_equal(
+        reset.belief.learned.layer.root[0], start.belief.learned.layer.root[0]
+    )
 
 
 def test_plans_use_what_was_learned():
@@ -79,7 +83,7 @@ def test_plans_use_what_was_learned():
     for adaptation in ("none", "last-layer"):
         agent = make_agent(opposite, adaptation=adaptation)
         state, _ = play(agent, 0.4, 25, first_random=10)
-        ends[adaptation] = np.abs(np.asarray(state.recent.next_obs[:, -1])).max()
+        ends[adaptation] = np.abs(np.asarray(state.belief.recent.next_obs[:, -1])).max()
     assert ends["last-layer"] < 0.6
     assert ends["none"] > 2.0
 
@@ -96,14 +100,14 @@ def test_without_anything_to_learn_actions_are_those_of_frozen_heads():
 def test_absurd_observations_give_finite_actions_and_are_not_learned(value, settings):
     agent = make_agent(toys.small_model(), **settings)
     spike = np.full((2, 2), value, np.float32)
-    agent = dataclasses.replace(agent, prior=POINT_PRIOR)
+    agent = make_agent(toys.small_model(), POINT_PRIOR, **settings)
     state, decisions = play(agent, 1.0, 8, spike=spike)
     for decision in decisions:
         assert np.isfinite(decision.action).all()
-    assert np.isfinite(state.learned.layer.weight).all()
-    assert np.abs(state.learned.layer.weight).max() < 1e3
+    assert np.isfinite(state.belief.learned.layer.weight).all()
+    assert np.abs(state.belief.learned.layer.weight).max() < 1e3
     if settings:
-        assert np.isfinite(state.learned.suspicion).all()
+        assert np.isfinite(state.belief.learned.suspicion).all()
 
 
 def test_one_head_without_context_and_deterministic_models_learn_too():
@@ -113,7 +117,7 @@ def test_one_head_without_context_and_deterministic_models_learn_too():
     )
     state, decisions = play(make_agent(model), 1.0, 5)
     assert np.isfinite(decisions[-1].action).all()
-    assert np.abs(state.learned.layer.weight).max() > 0.0
+    assert np.abs(state.belief.learned.layer.weight).max() > 0.0
 
 
 def test_changed_physics_are_noticed_and_what_was_learned_is_dropped():
@@ -125,7 +129,7 @@ def test_changed_physics_are_noticed_and_what_was_learned_is_dropped():
         after, _ = play(agent, -0.2, 12, state=state, first_random=12)
         errors[threshold] = np.abs(predicted_gain(agent, after) + 0.2).max()
         if threshold:
-            assert (np.asarray(before.learned.suspicion) < threshold).all()
+            assert (np.asarray(before.belief.learned.suspicion) < threshold).all()
     assert errors[10.0] < 0.05
     assert errors[10.0] < 0.5 * errors[0.0]
 
@@ -140,7 +144,7 @@ def by_chance(agent, gain, steps, *, state, glitches=()):
         obs = obs + gain * np.asarray(state.action)
         obs[0] += 3.0 * (step in glitches)
         state, _ = agent.act(state, obs.astype(np.float32))
-        layers.append(state.learned.layer)
+        layers.append(state.belief.learned.layer)
     return state, layers
 
 
@@ -162,7 +166,7 @@ def test_a_change_is_noticed_after_a_glitch_and_only_where_it_happens():
     agent = make_agent(change_threshold=20.0)
     state, _ = play(agent, 1.0, 15, first_random=15)
     state, _ = by_chance(agent, 1.0, 8, state=state, glitches=[2])
-    assert (np.asarray(state.learned.suspicion) == 0).all()
+    assert (np.asarray(state.belief.learned.suspicion) == 0).all()
     gains = np.float32([[-0.2], [1.0]])
     state, layers = by_chance(agent, gains, 12, state=state)
     counts = np.asarray([layer.count for layer in layers])[..., 0]
@@ -179,10 +183,10 @@ def test_errors_larger_than_in_training_are_not_taken_for_changes():
     rng = np.random.default_rng(1)
     state, _ = play(agent, 1.0, 8, first_random=8)
     for _ in range(20):
-        obs = np.asarray(state.recent.next_obs[:, -1]) + rng.normal(size=(2, 2), scale=0.1)
+        obs = np.asarray(state.belief.recent.next_obs[:, -1]) + rng.normal(size=(2, 2), scale=0.1)
         state, _ = agent.act(state, obs.astype(np.float32))
         state = state._replace(action=jnp.asarray(rng.uniform(-0.5, 0.5, (2, 2)), jnp.float32))
-    assert (np.asarray(state.learned.layer.count) > 20).all()
+    assert (np.asarray(state.belief.learned.layer.count) > 20).all()
 
 
 def test_an_agent_needs_a_prior_to_adapt_and_a_prior_needs_episodes():

@@ -11,15 +11,15 @@ import pytest
 import toys
 from headway.config import CEMConfig, GradientAdaptedConfig, PlannerConfig, RecurrentConfig
 from headway.errors import ConfigError
-from headway.models.adapted import ReluNet, Window, adapt
-from headway.models.dynamics import network_input
-from headway.models.recurrent import RecurrentNet
-from headway.planning.acting import RandomAgent
-from headway.planning.controller import Controller, env_action
-from headway.planning.heads import RecentTransitions
-from headway.planning.meta.agent import AdaptiveAgent, imagine
-from headway.planning.meta.models import GradientAdapted, Recurrent, Transition
-from headway.planning.returns import RolloutSettings, candidate_returns
+from headway.models.base import RecentTransitions, Transition
+from headway.models.grbal import GrBAL, ReluNet, Window, adapt
+from headway.models.multi_headed import network_input
+from headway.models.rebal import ReBAL, RecurrentNet
+from headway.planning.agent import Agent
+from headway.planning.controller import Controller
+from headway.planning.rollouts import candidate_returns
+from headway.task import env_action
+from headway.training.diagnostics import imagine
 from headway.training.methods import METHODS
 
 TASK = toys.ScaledTask()
@@ -33,6 +33,8 @@ PLANNER = PlannerConfig(
 )
 KINDS = ["gradient", "recurrent"]
 
+KEYS = jax.random.split(jax.random.key(0))
+
 close = functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6)
 
 
@@ -41,12 +43,9 @@ def model_of(kind, length=3, rate=0.1):
     if kind == "gradient":
         config = GradientAdaptedConfig(hidden_sizes=SIZES)
         net = ReluNet.init(config, TASK, key=jax.random.key(0))
-        return GradientAdapted(net, statistics, TASK, length, rate)
-    return Recurrent(
-        RecurrentNet.init(RecurrentConfig(hidden_sizes=SIZES), TASK, key=jax.random.key(0)),
-        statistics,
-        TASK,
-    )
+        return GrBAL(net, statistics, TASK, length, rate)
+    net = RecurrentNet.init(RecurrentConfig(hidden_sizes=SIZES), TASK, key=jax.random.key(0))
+    return ReBAL(net, statistics, TASK)
 
 
 def transitions(count, num_envs=2, seed=0):
@@ -62,9 +61,9 @@ def transitions(count, num_envs=2, seed=0):
 
 @eqx.filter_jit
 def live(model, steps):
-    memory = model.start(len(steps[0].obs))
+    memory = model.init_belief(len(steps[0].obs))
     for step in steps:
-        memory = model.remember(memory, step)
+        memory = model.observe(memory, step, KEYS)
     return memory
 
 
@@ -77,9 +76,9 @@ def delta_of(model, memory, obs, action):
         one = dynamics.of_env(part)
         carry = jax.tree.map(lambda x: x[..., None, None], one.start())
         wide = obs[None, :, None, None], action[None, :, None, None]
-        return one.step(TASK, carry, *wide, None)[1][0, :, 0, 0]
+        return one.step(carry, *wide, None)[1][0, :, 0, 0]
 
-    return jax.vmap(one)(dynamics.per_env, obs, action)
+    return jax.vmap(one)(dynamics.own, obs, action)
 
 
 def predicted(net, statistics, obs, action):
@@ -128,7 +127,7 @@ def test_the_state_goes_on_by_what_was_observed_and_done():
 def test_what_did_not_happen_is_not_remembered(kind):
     model, steps = model_of(kind), transitions(4)
     before = live(model, steps[:3])
-    after = model.remember(before, steps[3]._replace(happened=jnp.array([True, False])))
+    after = model.observe(before, steps[3]._replace(happened=jnp.array([True, False])), KEYS)
     for old, new in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
         np.testing.assert_array_equal(old[1], new[1])
     changed = jax.tree.map(lambda old, new: bool((old[0] != new[0]).any()), before, after)
@@ -142,9 +141,8 @@ def test_returns_are_those_of_steps_taken_one_by_one(kind):
     obs = jnp.asarray(rng.normal(size=(2, 2)), jnp.float32)
     candidates = jnp.asarray(rng.uniform(-1, 1, (2, 4, 3, 2)), jnp.float32)
     dynamics = model.dynamics(memory, "float32")
-    settings = RolloutSettings.of(PLANNER, 1)
     key = jax.random.key(0)
-    found = candidate_returns(dynamics, TASK, obs, candidates, settings=settings, key=key)
+    found = candidate_returns(dynamics, TASK, obs, candidates, planner=PLANNER, key=key)
     for env, candidate in ((0, 0), (0, 3), (1, 1)):
         state, now, total, alive = memory, obs, 0.0, True
         for step in range(3):
@@ -155,14 +153,14 @@ def test_returns_are_those_of_steps_taken_one_by_one(kind):
             alive = alive and not bool(TASK.terminated(now, action, after)[env])
             if kind == "recurrent":  # imagined steps go into the state, but change no weights
                 yes = jnp.ones(2, bool)
-                state = model.remember(state, Transition(now, action, after, yes))
+                state = model.observe(state, Transition(now, action, after, yes), KEYS)
             now = after
         np.testing.assert_allclose(found[env, candidate], total, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_agent_learns_from_its_steps_and_begins_every_episode_anew(kind):
-    agent = AdaptiveAgent(model_of(kind), TASK, PLANNER)
+    agent = Agent(model_of(kind), TASK, PLANNER)
     rng = np.random.default_rng(0)
     observed = rng.normal(size=(6, 2, 2)).astype(np.float32)
 
@@ -178,20 +176,20 @@ def test_an_agent_learns_from_its_steps_and_begins_every_episode_anew(kind):
         Transition(*map(jnp.asarray, (observed[t], actions[t], observed[t + 1])), jnp.ones(2, bool))
         for t in range(5)
     ]
-    jax.tree.map(close, state.memory, live(agent.model, steps))
+    jax.tree.map(close, state.belief, live(agent.model, steps))
     np.testing.assert_array_equal(play()[1], actions)  # nothing is left of the first episode
-    fresh = agent.init(2, key=jax.random.key(0)).memory
-    jax.tree.map(np.testing.assert_array_equal, fresh, agent.model.start(2))
+    fresh = agent.init(2, key=jax.random.key(0)).belief
+    jax.tree.map(np.testing.assert_array_equal, fresh, agent.model.init_belief(2))
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_imagining_lives_through_the_past_first(kind):
-    agent = AdaptiveAgent(model_of(kind), TASK, PLANNER)
+    agent = Agent(model_of(kind), TASK, PLANNER)
     steps = transitions(5)
     slots = [jnp.stack([getattr(s, name) for s in steps], 1) for name in Transition._fields[:3]]
     actions = jnp.asarray(np.random.default_rng(4).uniform(-1, 1, (2, 2, 2)), jnp.float32)
     young = RecentTransitions(*slots, jnp.array([5, 3]))
-    found = imagine(agent, young, actions)[0, :, 0]
+    found = imagine(agent.model, young, actions, KEYS)[0, :, 0]
     for env, count in ((0, 5), (1, 3)):
         memory = live(agent.model, steps[5 - count :])
         wanted = delta_of(agent.model, memory, steps[-1].next_obs, actions[:, 0])[env]
@@ -203,10 +201,10 @@ def test_bfloat16_products_stay_close(kind):
     model, steps = model_of(kind), transitions(5)
     memory, now = live(model, steps), steps[0]
     obs, candidates = now.obs, now.action[:, None, None]
-    settings, key = RolloutSettings.of(PLANNER, 1), jax.random.key(0)
+    key = jax.random.key(0)
     exact, coarse = (
         candidate_returns(
-            model.dynamics(memory, precision), TASK, obs, candidates, settings=settings, key=key
+            model.dynamics(memory, precision), TASK, obs, candidates, planner=PLANNER, key=key
         )
         for precision in ("float32", "bfloat16")
     )
@@ -214,9 +212,9 @@ def test_bfloat16_products_stay_close(kind):
 
 
 def test_a_controller_holds_to_the_last_plan_where_a_sensor_fails():
-    controller = Controller(AdaptiveAgent(model_of("recurrent"), TASK, PLANNER))
+    controller = Controller(Agent(model_of("recurrent"), TASK, PLANNER))
     controller.act(np.zeros(2))
-    memory, plan = jax.device_get((controller._state.memory, controller._state.search.guess[0]))
+    memory, plan = jax.device_get((controller._state.belief, controller._state.search.guess[0]))
     for step in range(PLANNER.horizon - 1):
         found = controller.act(np.array([np.nan, 0.0]))
         np.testing.assert_allclose(found, env_action(TASK, plan[step]), atol=1e-6)
@@ -225,12 +223,12 @@ def test_a_controller_holds_to_the_last_plan_where_a_sensor_fails():
     assert controller.act(np.zeros(2)).shape == (2,)
     assert controller.status.outcome == "planned"
     # What was done unseen is no transition to learn from.
-    jax.tree.map(np.testing.assert_array_equal, controller._state.memory, memory)
+    jax.tree.map(np.testing.assert_array_equal, controller._state.belief, memory)
 
 
 @pytest.mark.parametrize("kind", ["gradient", "recurrent"])
 def test_a_deadline_that_is_long_enough_changes_nothing(kind):
-    agent = AdaptiveAgent(model_of(kind), TASK, PLANNER)
+    agent = Agent(model_of(kind), TASK, PLANNER)
     plain, timed = Controller(agent), Controller(agent, deadline_ms=1e6)
     for step in range(3):
         obs = np.array([0.1 * step, -0.2])
@@ -240,7 +238,7 @@ def test_a_deadline_that_is_long_enough_changes_nothing(kind):
 
 
 def test_a_search_that_runs_out_of_time_is_cut_off(monkeypatch):
-    controller = Controller(AdaptiveAgent(model_of("recurrent"), TASK, PLANNER), deadline_ms=1e6)
+    controller = Controller(Agent(model_of("recurrent"), TASK, PLANNER), deadline_ms=1e6)
     assert controller._deadline is not None
     monkeypatch.setattr(controller._deadline, "_fits", lambda until: False)
     controller.act(np.zeros(2))
@@ -252,29 +250,28 @@ def test_a_search_that_runs_out_of_time_is_cut_off(monkeypatch):
 
 def test_an_agent_that_makes_no_plan_has_no_deadline():
     with pytest.raises(ConfigError, match=r"is 50, but random makes no plan .*allowed: None"):
-        Controller(RandomAgent(TASK), deadline_ms=50.0)
+        Controller(Agent(None, TASK, PLANNER), deadline_ms=50.0)
     assert "random" in METHODS
 
 
 @pytest.mark.parametrize("kind", ["gradient", "recurrent"])
 def test_observations_unlike_the_training_data_are_named(kind):
-    controller = Controller(AdaptiveAgent(model_of(kind), TASK, PLANNER))
+    controller = Controller(Agent(model_of(kind), TASK, PLANNER))
     controller.act(np.full(2, 1e4))
     assert controller.status is not None
     assert controller.status.outcome == "planned"
     assert controller.status.warnings
 
 
-def test_an_iteration_that_failed_is_no_failed_plan():
-    agent = AdaptiveAgent(model_of("recurrent"), TASK, PLANNER)
-    one = jnp.ones(1, jnp.int32)
+def test_an_iteration_that_failed_is_no_failed_plan(monkeypatch):
+    act = Agent.act
 
-    class FailsOnce(AdaptiveAgent):
-        def act(self, state, obs):
-            state, decision = agent.act(state, obs)
-            return state, decision._replace(failures=one)
+    def fails_once(self, state, obs):
+        state, decision = act(self, state, obs)
+        return state, decision._replace(failures=jnp.ones(1, jnp.int32))
 
-    controller = Controller(FailsOnce(agent.model, TASK, PLANNER))
+    monkeypatch.setattr(Agent, "act", fails_once)
+    controller = Controller(Agent(model_of("recurrent"), TASK, PLANNER))
     controller.act(np.zeros(2))
     assert controller.status is not None
     assert (controller.status.outcome, controller.status.iterations) == ("planned", 2)

@@ -9,12 +9,10 @@ import pytest
 import toys
 from headway.config import CEMConfig, MultiHeadedConfig, PlannerConfig
 from headway.errors import ConfigError
-from headway.models.adapted import ReluNet
-from headway.planning.acting import RandomAgent
+from headway.models.grbal import GrBAL, ReluNet
 from headway.planning.agent import Agent
-from headway.planning.controller import Controller, env_action, scaled_action
-from headway.planning.meta.agent import AdaptiveAgent
-from headway.planning.meta.models import GradientAdapted
+from headway.planning.controller import Controller
+from headway.task import env_action, scaled_action
 
 PLANNER = PlannerConfig(
     horizon=3,
@@ -40,7 +38,9 @@ TASK = Valves()
 
 def make_controller(**options) -> Controller:
     statistics = toys.identity_statistics(TASK)
-    return Controller(Agent(UP_DOWN, statistics, TASK, PLANNER, 3), **options)
+    return Controller(
+        toys.make_agent(UP_DOWN, PLANNER, statistics=statistics, task=TASK), **options
+    )
 
 
 def mirror(action):
@@ -57,7 +57,7 @@ def test_heads_are_chosen_by_what_was_applied(told, heads):
         obs = obs + scaled_action(TASK, applied)
     controller.act(obs, applied_action=applied if told else None)
     assert np.asarray(controller.heads).tolist() == heads
-    newest = controller._state.recent.action[0, -1]
+    newest = controller._state.belief.recent.action[0, -1]
     wanted = scaled_action(TASK, applied if told else asked)
     np.testing.assert_allclose(newest, wanted, atol=1e-6)
     assert np.abs(wanted).min() > 1e-3
@@ -77,20 +77,20 @@ def test_nothing_is_learned_from_a_step_whose_action_is_not_known():
     controller = make_controller()
     controller.act(OBS)
     controller.act(OBS, applied_action=np.array([0.0, np.nan]))
-    assert int(controller._state.recent.count[0]) == 0
+    assert int(controller._state.belief.recent.count[0]) == 0
     controller.act(OBS)
-    assert int(controller._state.recent.count[0]) == 1
-    assert np.isfinite(np.asarray(controller._state.recent.action)).all()
+    assert int(controller._state.belief.recent.count[0]) == 1
+    assert np.isfinite(np.asarray(controller._state.belief.recent.action)).all()
 
 
 def test_a_model_that_adapts_learns_from_what_was_applied():
     config = MultiHeadedConfig(hidden_sizes=(4,), num_members=1, num_heads=1, deterministic=True)
     net = ReluNet.init(config, TASK, key=jax.random.key(0))
-    model = GradientAdapted(net, toys.identity_statistics(TASK), TASK, 2, 0.1)
-    controller = Controller(AdaptiveAgent(model, TASK, PLANNER))
+    model = GrBAL(net, toys.identity_statistics(TASK), TASK, 2, 0.1)
+    controller = Controller(Agent(model, TASK, PLANNER))
     controller.act(OBS)
     controller.act(OBS, applied_action=[1.0, 10.0])
-    np.testing.assert_allclose(controller._state.memory.action[0, -1], [0.5, -0.5], atol=1e-6)
+    np.testing.assert_allclose(controller._state.belief.action[0, -1], [0.5, -0.5], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -112,11 +112,13 @@ def test_what_cannot_be_an_action_is_an_error_and_changes_nothing(applied, messa
     assert "\n" not in str(caught.value)
     assert controller._state is before
     controller.act(OBS, applied_action=[2.3, -3.9])  # as a sensor may have it
-    np.testing.assert_allclose(controller._state.recent.action[0, -1], [1.15, -1.195], atol=1e-6)
+    np.testing.assert_allclose(
+        controller._state.belief.recent.action[0, -1], [1.15, -1.195], atol=1e-6
+    )
 
 
 def test_an_agent_that_remembers_no_actions_checks_them_all_the_same():
-    controller = Controller(RandomAgent(TASK))
+    controller = Controller(Agent(None, TASK, PLANNER))
     controller.act(OBS, applied_action=[0.0, 1.0])
     with pytest.raises(ConfigError, match="applied_action has shape"):
         controller.act(OBS, applied_action=[0.0])

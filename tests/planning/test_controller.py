@@ -12,13 +12,13 @@ import pytest
 import toys
 from headway.config import CEMConfig, ICEMConfig, MPPIConfig, PlannerConfig, RandomShootingConfig
 from headway.errors import ConfigError, PlanningError
-from headway.models.dynamics import Statistics
+from headway.models.multi_headed import Statistics
 from headway.planning import agent as agent_module
 from headway.planning.agent import Agent
 from headway.planning.controller import Controller
 from headway.planning.deadline import DeadlinePlanner
 from headway.planning.optimizers import make_optimizer
-from headway.planning.step import scoring
+from headway.planning.rollouts import candidate_returns
 
 TINY = PlannerConfig(
     horizon=4,
@@ -35,8 +35,7 @@ LONG = 1e7  # milliseconds
 
 
 def make_agent(model=UP_DOWN, *, statistics=None, **settings) -> Agent:
-    statistics = statistics or toys.identity_statistics()
-    return Agent(model, statistics, toys.POINT, dataclasses.replace(TINY, **settings), 3)
+    return toys.make_agent(model, dataclasses.replace(TINY, **settings), statistics=statistics)
 
 
 def play(controller, steps, obs=OBS):
@@ -117,11 +116,16 @@ def test_a_search_that_is_cut_off_answers_with_the_best_so_far():
     work = Work(agent, 5.6)
     outcome = work.planner.act(state, OBS[None], work.now)
     # The same draws, those of the first two of four iterations, by hand.
-    prepared = eqx.filter_jit(agent.prepare)(state, jnp.asarray(OBS[None]))
-    score = scoring(agent.task, agent.planner, prepared.dynamics, jnp.asarray(OBS[None]))
+    obs = jnp.asarray(OBS[None])
+    step = eqx.filter_jit(agent_module.observe)(agent, state, obs)
+
+    def score(candidates, key):
+        args = step.dynamics, agent.task, obs, candidates
+        return candidate_returns(*args, planner=agent.planner, key=key)
+
     optimizer = make_optimizer(agent.planner)
     search = optimizer.begin(state.search)
-    for key in jax.random.split(prepared.plan_key, 4)[:2]:
+    for key in jax.random.split(step.plan_key, 4)[:2]:
         search = jax.jit(lambda search, key: optimizer.iterate(score, search, key))(search, key)
     wanted = optimizer.end(search).actions[:, 0]
     np.testing.assert_allclose(outcome.decision.action, wanted, atol=1e-5)
@@ -228,10 +232,10 @@ def test_an_observation_that_is_not_finite_is_answered_with_the_last_plan(bad, d
     controller.act(obs)  # the sensor is back
     assert controller.status.outcome == "planned"
     # What happened unseen is not taken for a transition.
-    assert int(controller._state.recent.count[0]) == 0
+    assert int(controller._state.belief.recent.count[0]) == 0
     controller.act(obs)
-    assert int(controller._state.recent.count[0]) == 1
-    assert np.isfinite(np.asarray(controller._state.recent.obs)).all()
+    assert int(controller._state.belief.recent.count[0]) == 1
+    assert np.isfinite(np.asarray(controller._state.belief.recent.obs)).all()
 
 
 def test_the_first_observation_must_be_finite():
@@ -287,8 +291,8 @@ def test_observations_unlike_the_training_data_are_named():
 @pytest.mark.parametrize(("deadline_ms", "steps"), [(None, 1000), (LONG, 400)])
 def test_many_steps_trace_once_and_take_no_more_memory(deadline_ms, steps, monkeypatch):
     traces = []
-    original = agent_module.encode
-    monkeypatch.setattr(agent_module, "encode", lambda *x: traces.append(1) or original(*x))
+    original = agent_module.observe
+    monkeypatch.setattr(agent_module, "observe", lambda *x: traces.append(1) or original(*x))
     # A setting that no other test compiled.
     agent = make_agent(
         num_iterations=2, optimizer=CEMConfig(initial_std=0.3217 if deadline_ms else 0.3218)

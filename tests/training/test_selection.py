@@ -8,8 +8,7 @@ import pytest
 import toys
 from headway.config import CEMConfig, PlannerConfig
 from headway.data import History, Trajectory
-from headway.models.dynamics import Statistics, network_input
-from headway.planning.agent import Agent
+from headway.models.multi_headed import Statistics, network_input
 from headway.training.selection import EpisodeSelection, examine, summarise
 
 TINY = PlannerConfig(
@@ -22,9 +21,8 @@ TINY = PlannerConfig(
 )
 
 
-def make_agent(model, statistics=None, planner=TINY):
-    statistics = statistics or toys.odd_statistics()
-    return Agent(model, statistics, toys.POINT, planner, toys.SMALL.history_length)
+def make_agent(net, statistics=None, planner=TINY):
+    return toys.make_agent(net, planner, statistics=statistics or toys.odd_statistics())
 
 
 def by_hand(errors, chosen, deviations=None):
@@ -56,11 +54,11 @@ def test_it_examines_what_the_acting_agent_decided():
         lambda x: jnp.broadcast_to(jnp.asarray(x), (2, 1, *x.shape)),
         (np.diff(trajectory.obs[5:9], axis=0), trajectory.action[past]),
     )
-    statistics = agent.statistics
-    context = agent.model.context(History(*history), statistics)
+    statistics = agent.model.statistics
+    context = agent.model.net.context(History(*history), statistics)
     last = trajectory.obs[8:9], trajectory.action[8:9]
     x = network_input(toys.POINT, statistics, *map(jnp.asarray, last))
-    prediction = agent.model.forward_net(jnp.broadcast_to(x, (2, *x.shape)), context)
+    prediction = agent.model.net.forward_net(jnp.broadcast_to(x, (2, *x.shape)), context)
     delta = statistics.delta.normalize(jnp.asarray(np.diff(trajectory.obs[8:], axis=0)))
     difference = np.asarray(delta - prediction.mean)[:, :, 0]
     np.testing.assert_allclose(found.errors[-1], np.square(difference).mean(-1), rtol=1e-4)

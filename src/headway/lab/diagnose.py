@@ -12,7 +12,7 @@ from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import ConfigError
 from headway.lab.tables import COLLECTED, distinct, full_label, group_label, new_table, varying
-from headway.planning.agent import Agent
+from headway.planning.heads import MultiHeadModel
 from headway.task import sim_param_sets
 from headway.training.evaluate import known_groups, run_tests
 from headway.training.loading import load_agent
@@ -129,7 +129,7 @@ def examined(
         RunError: There is no trained run, or it is damaged.
     """
     agent = load_agent(run, config)
-    assert isinstance(agent, Agent)
+    assert isinstance(agent.model, MultiHeadModel)
     key = jax.random.key(config.evaluation.seed)
     episodes = {
         group: examine(agent, found, key=jax.random.fold_in(key, i))

@@ -17,7 +17,6 @@ from headway.config import FittingConfig
 from headway.data import Episodes, Samples, segment_sums
 from headway.models.batches import Batch
 from headway.models.compilation import in_each_precision
-from headway.models.dynamics import GaussianNet, MultiHeadDynamics, Statistics, network_input
 from headway.models.losses import (
     assign_heads,
     independent_loss,
@@ -26,6 +25,7 @@ from headway.models.losses import (
     negative_log_likelihood,
     oracle_loss,
 )
+from headway.models.multi_headed import GaussianNet, MultiHeadDynamics, Statistics, network_input
 from headway.models.relation import add_parts, intervene, relation_gradient, relation_parts
 from headway.models.shuffling import permutations
 from headway.models.updates import EpochStats, unless_broken

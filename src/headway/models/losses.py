@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from headway.models.dynamics import ContextEncoder, GaussianNet, MultiHeadDynamics, Prediction
+from headway.models.multi_headed import ContextEncoder, GaussianNet, MultiHeadDynamics, Prediction
 
 HIDDEN_DECAY = (2.5e-5, 5e-5, 7.5e-5)
 HEAD_DECAY = 1e-4

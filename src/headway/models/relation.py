@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 
 from headway.config import FittingConfig
 from headway.models.batches import Batch
-from headway.models.dynamics import (
+from headway.models.losses import HIDDEN_DECAY, sum_of_squares, weight_decay_loss
+from headway.models.multi_headed import (
     ContextEncoder,
     GaussianNet,
     MultiHeadDynamics,
@@ -23,7 +24,6 @@ from headway.models.dynamics import (
     flat_history,
     network_input,
 )
-from headway.models.losses import HIDDEN_DECAY, sum_of_squares, weight_decay_loss
 from headway.models.networks import Dense, swish
 from headway.task import Task
 

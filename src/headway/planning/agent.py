@@ -1,69 +1,70 @@
-"""An agent: recent history, head selection, and a planner around a dynamics model."""
+"""One agent for every method: observe, specialise the model, search, act (paper, section 3.3)."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from headway.config import PlannerConfig
 from headway.data import sim_params_row
-from headway.errors import ConfigError
-from headway.models.dynamics import MultiHeadDynamics, Statistics
-from headway.planning.acting import Decision
-from headway.planning.heads import RecentTransitions, head_errors, select_heads
-from headway.planning.imagination import ImaginedDynamics
-from headway.planning.last_layer.learning import Learned, learn
-from headway.planning.last_layer.regression import Prior
-from headway.planning.optimizers import Plan, SearchState, make_optimizer, where_env
-from headway.planning.search import act
+from headway.models.base import Model, Transition
+from headway.models.compilation import in_each_precision
+from headway.planning import cpu
+from headway.planning.optimizers import Optimizer, Plan, make_optimizer
+from headway.planning.rollouts import candidate_returns
 from headway.task import Task
 
 
 class AgentState(NamedTuple):
-    """What an agent remembers of each environment between two steps."""
+    """All that an agent keeps of its environments between two steps; a pytree."""
 
-    recent: RecentTransitions
+    belief: Any
+    """The model's own."""
     obs: Float[Array, "env obs"]
     action: Float[Array, "env action"]
+    """The last action, in [-1, 1]."""
     acted: Bool[Array, " env"]
-    search: SearchState
+    """Where that action, taken at `obs`, led to what is observed next."""
+    search: Any
+    """Where the last search ended, one step later (`SearchState`); None for a random agent."""
     key: PRNGKeyArray
-    learned: Learned
-    """What the heads learned in this episode."""
-    sim_params: Float[Array, "env sim_param"] | None = None
-    """The true simulator parameters, for a model that is told them."""
+
+
+class Decision(NamedTuple):
+    """The outcome of one step."""
+
+    action: Float[Array, "env action"]
+    """The action to take, in [-1, 1]."""
+    heads: Int[Array, "env member"] | None
+    """The head each member plans with; with `average`, the one that would be adaptive. None
+    where a model has no heads."""
+    failures: Int[Array, " env"]
+    """Planner iterations without any finite return."""
+    evaluations: Int[Array, " env"]
+    """Candidates whose return was imagined, each with `num_particles` rollouts."""
 
 
 class Agent(eqx.Module):
     """Plans for many environments at once, each with its own physics.
 
     All arrays have a leading environment axis. The agent itself holds no state; weights are
-    leaves, so one compiled `act` serves a model through all of its training.
+    leaves, so one compiled step serves a model through all of its training.
     """
 
-    model: MultiHeadDynamics
-    statistics: Statistics
+    model: Model | None
+    """None acts at random."""
     task: Task
     planner: PlannerConfig = eqx.field(static=True)
-    history_length: int = eqx.field(static=True)
-    prior: Prior | None = None
-    """Where heads that keep learning start; `last_layer.prior.fit_prior` finds it."""
-
-    def __check_init__(self):
-        if self.planner.adaptation != "none" and self.prior is None:
-            raise ConfigError(
-                "planner.adaptation is 'last-layer', but the agent has no prior; make it with"
-                " headway.planning.last_layer.prior.fit_prior, or set planner.adaptation to none."
-            )
 
     @property
     def sim_param_names(self) -> tuple[str, ...]:
         """The true simulator parameters that the model must be told; mostly none."""
-        return self.model.sim_param_names
+        return self.model.sim_param_names if self.model is not None else ()
 
     def init(
         self,
@@ -72,10 +73,10 @@ class Agent(eqx.Module):
         key: PRNGKeyArray,
         sim_params: Sequence[Mapping[str, float]] | None = None,
     ) -> AgentState:
-        """Remember nothing yet of `num_envs` environments.
+        """The state at the beginning of an episode.
 
         Args:
-            num_envs: How many environments.
+            num_envs: Number of environments.
             key: The planner's draws.
             sim_params: The true simulator parameters of each environment. Only a model with
                 `model.context="sim-params"` looks at them.
@@ -83,118 +84,173 @@ class Agent(eqx.Module):
         Raises:
             ConfigError: The model is told simulator parameters, and one has no value.
         """
-        physics, names = None, self.sim_param_names
+        belief, search, told, names = (), None, None, self.sim_param_names
+        action_size = self.task.action_size
         if names:
             rows = [sim_params_row(row, names) for row in sim_params or [{}]]
-            physics = jnp.broadcast_to(np.stack(rows), (num_envs, len(names)))
-        slots = max(self.history_length, self.planner.selection_length)
-        action_size = self.task.action_size
-        return AgentState(
-            RecentTransitions.empty(num_envs, slots, self.task),
-            jnp.zeros((num_envs, self.task.obs_size)),
-            jnp.zeros((num_envs, action_size)),
-            jnp.zeros(num_envs, bool),
-            make_optimizer(self.planner).init(num_envs, self.planner.horizon, action_size),
-            key,
-            Learned.nothing(self, num_envs),
-            physics,
-        )
+            told = jnp.broadcast_to(np.stack(rows), (num_envs, len(names)))
+        if self.model is not None:
+            belief = self.model.init_belief(num_envs, told)
+            optimizer = make_optimizer(self.planner)
+            search = optimizer.init(num_envs, self.planner.horizon, action_size)
+        obs = jnp.zeros((num_envs, self.task.obs_size))
+        action = jnp.zeros((num_envs, action_size))
+        return AgentState(belief, obs, action, jnp.zeros(num_envs, bool), search, key)
 
     def act(
         self, state: AgentState, obs: Float[Array | np.ndarray, "env obs"]
     ) -> tuple[AgentState, Decision]:
-        """Choose the next action of every environment (paper, section 3.3)."""
-        return act(self, state, jnp.asarray(obs, jnp.float32))
-
-    def prepare(self, state: AgentState, obs: Float[Array, "env obs"]) -> "Prepared":
-        """See `Planning.prepare`."""
-        key, head_key, error_key, plan_key = jax.random.split(state.key, 4)
-        # 1. Remember the transition that the last action caused.
-        recent = state.recent.push(state.obs, state.action, obs, state.acted)
-        # 2. Encode the recent past, once per member, for the whole plan.
-        context = encode(self, recent, state.sim_params)
-        # 3. Learn from that transition, where anything keeps learning.
-        learned = learn(self, state.learned, recent, context, state.acted)
-        # 4. Choose the head that best explains the recent past.
-        heads = choose_heads(self, recent, context, error_key=error_key, head_key=head_key)
-        chosen, layer = planning_heads(self, heads), learned.layer
-        dynamics = ImaginedDynamics.fold(
-            self.model,
-            self.statistics,
-            chosen,
-            context,
-            precision=self.planner.precision,
-            correction=None if layer is None else layer.weight,
-        )
-        return Prepared(recent, learned, heads, dynamics, key, plan_key)
-
-    def decide(
-        self, state: AgentState, obs: Float[Array, "env obs"], prepared: "Prepared", plan: Plan
-    ) -> tuple[AgentState, Decision]:
-        """See `Planning.decide`."""
-        recent, learned, heads, _, key, _ = prepared
-        action = plan.actions[:, 0]
-        acted = jnp.ones_like(state.acted)
-        search = make_optimizer(self.planner).shift(plan.state)
-        state = AgentState(recent, obs, action, acted, search, key, learned, state.sim_params)
-        return state, Decision(action, heads, plan.failures, plan.evaluations)
+        """Choose the next action of every environment."""
+        obs = jnp.asarray(obs, jnp.float32)
+        if self.model is None:
+            key, draw = jax.random.split(state.key)
+            action = jax.random.uniform(draw, state.action.shape, minval=-1.0)
+            none = jnp.zeros(len(obs), jnp.int32)
+            return state._replace(action=action, key=key), Decision(action, None, none, none)
+        # Threads know nothing of a step that is part of another program (jit, vmap).
+        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((state, obs)))
+        if traced or (self.model.traceable and _shards(self, len(obs)) == 1):
+            return _act[self.planner.precision](self, state, obs)
+        step, search = begin(self, state, obs)
+        for iteration in range(self.planner.num_iterations):
+            search = iterate(self, step, search, iteration)
+        return end(self, step, search)
 
 
-class Prepared(NamedTuple):
+class Step(NamedTuple):
     """All that is known in a step before its search."""
 
-    recent: RecentTransitions
-    learned: Learned
-    heads: Int[Array, "env member"]
-    dynamics: ImaginedDynamics
-    key: PRNGKeyArray
+    belief: Any
+    dynamics: Any
+    obs: Float[Array, "env obs"]
     plan_key: PRNGKeyArray
+    next_key: PRNGKeyArray
 
 
-def encode(
-    agent: Agent,
-    recent: RecentTransitions,
-    sim_params: Float[Array, "env sim_param"] | None = None,
-) -> Float[Array, "member env context"] | None:
-    """The context vector of every member and environment."""
-    members = agent.model.num_members
-    history, sim_params = jax.tree.map(
-        lambda x: jnp.broadcast_to(x, (members, *x.shape)),
-        (recent.history(agent.history_length), sim_params),
-    )
-    return agent.model.context(history, agent.statistics, sim_params)
+def observe(agent: Agent, state: AgentState, obs: Float[Array, "env obs"]) -> Step:
+    """Let the model observe what the last action caused, and specialise it to its belief."""
+    assert agent.model is not None
+    keys = jax.random.split(state.key, 4)
+    seen = Transition(state.obs, state.action, obs, state.acted)
+    belief = agent.model.observe(state.belief, seen, keys[1:3])
+    dynamics = agent.model.dynamics(belief, agent.planner.precision)
+    return Step(belief, dynamics, obs, plan_key=keys[3], next_key=keys[0])
 
 
-def choose_heads(
-    agent: Agent,
-    recent: RecentTransitions,
-    context: Float[Array, "member env context"] | None,
-    *,
-    error_key: PRNGKeyArray,
-    head_key: PRNGKeyArray,
-) -> Int[Array, "env member"]:
-    """One head per environment and member, by its error on the recent transitions."""
-    slots, used = recent.newest(agent.planner)
-    if agent.planner.head_selection == "random":
-        used = jnp.zeros_like(used)
-    sampling_key = error_key if agent.planner.selection_error == "sampled" else None
-    errors = head_errors(
-        agent.model, agent.task, agent.statistics, slots, context, sampling_key=sampling_key
-    )
-    return select_heads(errors, used, key=head_key)
+def decide(agent: Agent, step: Step, plan: Plan) -> tuple[AgentState, Decision]:
+    """Take a plan's first action; where its search ended, one step later, is the next start."""
+    action, acted = plan.actions[:, 0], jnp.ones(len(step.obs), bool)
+    search = make_optimizer(agent.planner).shift(plan.state)
+    state = AgentState(step.belief, step.obs, action, acted, search, step.next_key)
+    heads = getattr(step.belief, "heads", None)
+    return state, Decision(action, heads, plan.failures, plan.evaluations)
 
 
-def planning_heads(
-    agent: Agent, heads: Int[Array, "env member"]
-) -> Int[Array, "env member choice"]:
-    """The heads that imagine: the chosen one, or all of them when they are averaged."""
-    if agent.planner.head_selection != "average":
-        return heads[..., None]
-    num_heads = agent.model.num_heads
-    return jnp.broadcast_to(jnp.arange(num_heads), (*heads.shape, num_heads))
+def act(
+    agent: Agent, state: AgentState, obs: Float[Array, "env obs"]
+) -> tuple[AgentState, Decision]:
+    """A whole step as one program: observe, specialise, search, decide."""
+    step = observe(agent, state, obs)
+
+    def score(candidates, key):
+        args = step.dynamics, agent.task, obs, candidates
+        return candidate_returns(*args, planner=agent.planner, key=key)
+
+    optimizer = make_optimizer(agent.planner)
+    return decide(agent, step, optimizer.optimize(score, state.search, key=step.plan_key))
 
 
-def reset_where(state: AgentState, fresh: AgentState, done: Bool[Array, " env"]) -> AgentState:
-    """Forget everything about the environments where an episode begins anew."""
-    kept = where_env(done, fresh._replace(key=None), state._replace(key=None))
-    return kept._replace(key=state.key)
+# The same step, iteration by iteration: a search can be cut off by a deadline, the cores of a CPU
+# can share its candidates, and a simulator that JAX cannot trace can score them.
+
+
+def begin(agent: Agent, state: AgentState, obs: Float[Array, "env obs"]) -> tuple[Step, Any]:
+    """All of a step that comes before its first iteration, and the search as it is then."""
+    return _begin[agent.planner.precision](agent, state, obs)
+
+
+def iterate(agent: Agent, step: Step, search: Any, iteration: int) -> Any:
+    """The search after another iteration: ask for candidates, score them, tell their returns."""
+    assert agent.model is not None
+    planner, optimizer = agent.planner, make_optimizer(agent.planner)
+    shards = _shards(agent, len(step.obs))
+    # Iterations of a kind are one program; which of them it is decides the key alone.
+    which = step.plan_key, np.int32(iteration), optimizer.kind(iteration)
+    if agent.model.traceable and shards == 1:
+        return _iterate[planner.precision](agent, step, search, *which)
+    candidates, score_key = _ask[planner.precision](optimizer, search, *which)
+
+    def returns_of(shard: cpu.Shard) -> Float[Array, "env shard"]:
+        args = step.dynamics, agent.task, step.obs, candidates
+        return _score[planner.precision](*args, planner=planner, key=score_key, shard=shard)
+
+    if agent.model.traceable:
+        returns = cpu.in_shards(returns_of, candidates.shape[1], shards)
+    else:
+        returns = [jnp.asarray(step.dynamics.returns(candidates))]
+    return _tell[planner.precision](optimizer, search, candidates, returns)
+
+
+def end(agent: Agent, step: Step, search: Any) -> tuple[AgentState, Decision]:
+    """The decision, by the search as it is now."""
+    return _end[agent.planner.precision](agent, step, search)
+
+
+def open_loop(planner: PlannerConfig, state: AgentState) -> AgentState:
+    """Go on along the last plan without a look: its next action is the state's `action`.
+
+    The plan is what the search's distribution was centred on in the end. The transition that the
+    action causes is not observed, because it begins unseen.
+
+    Args:
+        planner: The settings that made the plan.
+        state: Of an agent that plans.
+    """
+    search = make_optimizer(planner).shift(state.search)
+    unseen = jnp.zeros_like(state.acted)
+    return state._replace(action=state.search.guess[:, 0], acted=unseen, search=search)
+
+
+def _shards(agent: Agent, num_envs: int) -> int:
+    planner = agent.planner
+    per_env = planner.num_candidates * planner.num_particles * planner.horizon
+    return cpu.num_shards(num_envs * per_env)
+
+
+def _begun(agent: Agent, state: AgentState, obs: Float[Array, "env obs"]) -> tuple[Step, Any]:
+    return observe(agent, state, obs), make_optimizer(agent.planner).begin(state.search)
+
+
+def _asked(
+    optimizer: Optimizer, search: Any, plan_key: PRNGKeyArray, iteration: Int[Any, ""], kind: int
+) -> tuple[Float[Array, "env candidate horizon action"], PRNGKeyArray]:
+    """Candidates, and the key that scores them; keys as in `Optimizer.optimize`."""
+    key = jax.random.split(plan_key, optimizer.num_iterations)[iteration]
+    ask_key, score_key = jax.random.split(key)
+    return optimizer.ask(search, ask_key, kind), score_key
+
+
+def _told(
+    optimizer: Optimizer,
+    search: Any,
+    candidates: Float[Array, "env candidate horizon action"],
+    returns: list[Float[Array, "env shard"]],
+) -> Any:
+    return optimizer.tell(search, candidates, cpu.joined(returns, candidates.shape[1]))
+
+
+def _iterated(agent: Agent, step: Step, search: Any, *which: Any) -> Any:
+    optimizer = make_optimizer(agent.planner)
+    candidates, key = _asked(optimizer, search, *which)
+    args = step.dynamics, agent.task, step.obs, candidates
+    returns = candidate_returns(*args, planner=agent.planner, key=key)
+    return optimizer.tell(search, candidates, returns)
+
+
+def _ended(agent: Agent, step: Step, search: Any) -> tuple[AgentState, Decision]:
+    return decide(agent, step, make_optimizer(agent.planner).end(search))
+
+
+_act, _begin, _iterate, _ask, _tell, _end, _score = map(
+    in_each_precision, (act, _begun, _iterated, _asked, _told, _ended, candidate_returns)
+)

@@ -13,13 +13,11 @@ from numpy.typing import ArrayLike
 
 from headway.config import PlannerConfig
 from headway.errors import ConfigError, PlanningError
-from headway.models.dynamics import Statistics
-from headway.planning.acting import Acting
+from headway.models.multi_headed import Statistics
+from headway.planning.agent import Agent, open_loop
 from headway.planning.checking import RangeCheck, in_bounds, not_finite, one_row
 from headway.planning.deadline import DeadlinePlanner
-from headway.planning.devices import brought_to_each
-from headway.planning.step import Planning, hold
-from headway.task import Task
+from headway.task import env_action, scaled_action
 
 
 class Status(NamedTuple):
@@ -77,7 +75,7 @@ class Controller:
 
     def __init__(
         self,
-        agent: Acting,
+        agent: Agent,
         *,
         seed: int = 0,
         deadline_ms: float | None = None,
@@ -86,7 +84,7 @@ class Controller:
         self.agent = agent
         self._seed, self._episode = seed, -1
         self._range = self._deadline = None
-        statistics: Statistics | None = getattr(agent, "statistics", None)
+        statistics: Statistics | None = getattr(agent.model, "statistics", None)
         if statistics is not None and max_deviations is not None:
             self._range = RangeCheck(agent.task, statistics.features, max_deviations)
         if deadline_ms is not None:
@@ -177,7 +175,7 @@ class Controller:
     @property
     def _planner(self) -> PlannerConfig | None:
         """Settings of the planner, of an agent that plans."""
-        return getattr(self.agent, "planner", None)
+        return self.agent.planner if self.agent.model is not None else None
 
     @property
     def _num_iterations(self) -> int:
@@ -188,10 +186,9 @@ class Controller:
             raise ConfigError(
                 f"deadline_ms is {deadline_ms}, allowed: milliseconds above 0, or None for none."
             )
-        if not isinstance(self.agent, Planning):
-            name = getattr(self.agent, "method", type(self.agent).__name__)
+        if self.agent.model is None:
             raise ConfigError(
-                f"deadline_ms is {deadline_ms:g}, but {name} makes no plan that could be cut"
+                f"deadline_ms is {deadline_ms:g}, but random makes no plan that could be cut"
                 " off, allowed: None; or take a method that plans, such as tmcl or pets."
             )
         return DeadlinePlanner(self.agent, deadline_ms / 1000)
@@ -257,7 +254,7 @@ class Controller:
         """The next action of the last plan."""
         self._count(True, reason)
         planner: Any = self._planner  # there is a plan to hold to
-        self._state = _held(planner, brought_to_each(self._state))
+        self._state = _held(planner, self._state)
         scaled = jax.device_get(self._state.action[0])
         self._status = Status("held", reason, (), 0, time.perf_counter() - started)
         return env_action(self.agent.task, scaled)
@@ -279,21 +276,4 @@ class Controller:
             self._left -= 1
 
 
-_held: Callable[[Any, Any], Any] = eqx.filter_jit(hold)
-
-
-def env_action(
-    task: Task, action: Float[np.ndarray, "*batch action"]
-) -> Float[np.ndarray, "*batch action"]:
-    """`Task.scale_action` in NumPy, exactly within the environment's bounds."""
-    low, high = np.asarray(task.action_low), np.asarray(task.action_high)
-    scaled = low + 0.5 * (action.astype(np.float64) + 1.0) * (high - low)
-    return np.clip(scaled, low, high).astype(np.float32)
-
-
-def scaled_action(
-    task: Task, action: Float[np.ndarray, "*batch action"]
-) -> Float[np.ndarray, "*batch action"]:
-    """`Task.unscale_action` in NumPy."""
-    low, high = np.asarray(task.action_low), np.asarray(task.action_high)
-    return (2.0 * (action.astype(np.float64) - low) / (high - low) - 1.0).astype(np.float32)
+_held: Callable[[Any, Any], Any] = eqx.filter_jit(open_loop)

@@ -16,10 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from headway.planning.acting import Decision
+from headway.planning.agent import Agent, Decision, begin, end, iterate
 from headway.planning.optimizers import make_optimizer
-from headway.planning.search import begin, end, iterate
-from headway.planning.step import Planning
 
 REMEMBERED = 32
 """Calls whose durations are remembered."""
@@ -46,7 +44,7 @@ class DeadlinePlanner:
     """
 
     def __init__(
-        self, agent: Planning, seconds: float, clock: Callable[[], float] = time.perf_counter
+        self, agent: Agent, seconds: float, clock: Callable[[], float] = time.perf_counter
     ):
         self._agent, self._seconds, self._clock = agent, seconds, clock
         self._optimizer = make_optimizer(agent.planner)
@@ -89,7 +87,7 @@ class DeadlinePlanner:
             done += 1
         if done == 0:
             self._forget_slowest()
-        state, decision = self._timed("end", state, begun, search)
+        state, decision = self._timed("end", begun, search)
         complete = done == self._optimizer.num_iterations
         return Outcome(state, decision, done, complete)
 

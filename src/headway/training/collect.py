@@ -17,10 +17,9 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import BadEnvironmentError, HeadwayError
-from headway.planning.acting import Acting
-from headway.planning.controller import env_action
+from headway.planning.agent import Agent
 from headway.sim_params import SimParamSets
-from headway.task import Task, env_options, env_spec, episode_length, sim_param_sets
+from headway.task import Task, env_action, env_options, env_spec, episode_length, sim_param_sets
 from headway.training.run import Arrays, trajectories_from, trajectory_arrays
 
 if TYPE_CHECKING:
@@ -119,7 +118,7 @@ class AgentPolicy:
     """
 
     def __init__(
-        self, agent: Acting, num_envs: int, episodes: Sequence[Episode], *, key: PRNGKeyArray
+        self, agent: Agent, num_envs: int, episodes: Sequence[Episode], *, key: PRNGKeyArray
     ):
         self._agent = agent
         physics = [episode.sim_params for episode in fill(episodes, num_envs)]

@@ -1,7 +1,6 @@
 """What a trained model has learned: head shares per physics, error by imagined step."""
 
 from collections import defaultdict
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -11,13 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.data import Episodes, Trajectory, sim_params_row
-from headway.models.dynamics import MultiHeadDynamics, Statistics
+from headway.models.base import Keys, Model, RecentTransitions, live_through
 from headway.models.fitting import FitSetup, assign_segments
-from headway.planning.acting import Physics
-from headway.planning.agent import Agent, choose_heads, encode, planning_heads
-from headway.planning.heads import RecentTransitions
-from headway.planning.imagination import ImaginedDynamics
-from headway.planning.returns import follow
+from headway.models.multi_headed import MultiHeadDynamics, Statistics
+from headway.planning.agent import Agent
+from headway.planning.rollouts import follow
 from headway.training.run import format_sim_params
 
 NUM_STARTS = 256  # imagined rollouts per group in `prediction_error`
@@ -57,56 +54,28 @@ def head_shares(
 
 
 def prediction_error(
-    agent: Agent, trajectories: list[Trajectory], *, key: PRNGKeyArray
+    agent: Agent, trajectories: list[Trajectory], *, first: int, key: PRNGKeyArray
 ) -> Float[np.ndarray, " step"]:
     """Root mean squared error of imagined observations by step, over one planning horizon.
 
-    From evenly spread moments of real episodes the chosen heads predict, without noise, what
-    the episode's own actions lead to. Errors are in units of each dimension's standard
-    deviation over these episodes; members are averaged over.
-    """
-    slots = max(agent.history_length, agent.planner.selection_length)
-
-    def imagine(recent, actions, sim_params):
-        names = agent.sim_param_names
-        rows = [sim_params_row(row, names) for row in sim_params]
-        told = jnp.asarray(np.stack(rows)) if names else None
-        return _imagine(agent, recent, told, actions, key)
-
-    return imagined_error(
-        imagine,
-        trajectories,
-        agent.planner.horizon,
-        slots=slots,
-        first=slots,
-    )
-
-
-def imagined_error(
-    imagine: Callable[
-        [RecentTransitions, Array, Physics], Float[Array, "member start horizon obs"]
-    ],
-    trajectories: list[Trajectory],
-    horizon: int,
-    *,
-    slots: int,
-    first: int,
-) -> Float[np.ndarray, " step"]:
-    """`prediction_error` of anything that imagines.
+    From evenly spread moments of real episodes the model predicts, without noise, what the
+    episode's own actions lead to, after it has lived through what went before. Errors are in
+    units of each dimension's standard deviation over these episodes; members are averaged over.
 
     Args:
-        imagine: Predicts, from the past of some moments, what actions [start, horizon, action]
-            lead to; it may use the true simulator parameters.
+        agent: With a model that was trained.
         trajectories: Real episodes.
-        horizon: Imagined steps.
-        slots: Past transitions that `imagine` is given; fewer where an episode is younger.
         first: Steps of an episode before the first moment.
+        key: Draws of a head selection that is random or sampled.
     """
+    model, horizon = agent.model, agent.planner.horizon
+    assert model is not None
     starts = [(t, s) for t in trajectories for s in range(first, len(t) - horizon + 1)]
     if not starts:
         return np.zeros(0)
     starts = [starts[i] for i in np.linspace(0, len(starts) - 1, NUM_STARTS, dtype=int)]
-    std = np.concatenate([t.obs for t in trajectories]).std(0)
+    longest = max(len(t) for t in trajectories)
+    slots = longest if model.memory is None else max(model.memory, 1)
 
     def past(shift: int, name: str):
         rows = [getattr(t, name)[max(s - slots, 0) + shift : s + shift] for t, s in starts]
@@ -118,25 +87,24 @@ def imagined_error(
 
     count = jnp.asarray([min(s, slots) for _, s in starts], jnp.int32)
     recent = RecentTransitions(past(0, "obs"), past(0, "action"), past(1, "obs"), count)
-    truth = future(1, "obs")
-    physics = [trajectory.sim_params for trajectory, _ in starts]
-    imagined = imagine(recent, jnp.asarray(future(0, "action")), physics)
-    scaled = (np.asarray(imagined) - truth) / np.where(std > 1e-6, std, np.inf)
+    told, names = None, model.sim_param_names
+    if names:
+        told = jnp.asarray(np.stack([sim_params_row(t.sim_params, names) for t, _ in starts]))
+    actions = jnp.asarray(future(0, "action"))
+    imagined = imagine(model, recent, actions, jax.random.split(key), told)
+    std = np.concatenate([t.obs for t in trajectories]).std(0)
+    scaled = (np.asarray(imagined) - future(1, "obs")) / np.where(std > 1e-6, std, np.inf)
     return np.sqrt(np.square(scaled).mean((0, 1, 3)))
 
 
 @eqx.filter_jit
-def _imagine(
-    agent: Agent,
-    recent: RecentTransitions,
-    sim_params: Float[Array, "env sim_param"] | None,
+def imagine(
+    model: Model,
+    past: RecentTransitions,
     actions: Float[Array, "env horizon action"],
-    key: PRNGKeyArray,
+    keys: Keys,
+    sim_params: Float[Array, "env sim_param"] | None = None,
 ) -> Float[Array, "member env horizon obs"]:
-    """Mean prediction of every member along given actions, from many moments at once."""
-    head_key, error_key = jax.random.split(key)
-    context = encode(agent, recent, sim_params)
-    heads = choose_heads(agent, recent, context, error_key=error_key, head_key=head_key)
-    folded = planning_heads(agent, heads)
-    dynamics = ImaginedDynamics.fold(agent.model, agent.statistics, folded, context)
-    return follow(dynamics, agent.task, recent.next_obs[:, -1], actions)
+    """Mean prediction of every member along given actions, after living through the past."""
+    belief = live_through(model, past, keys, sim_params)
+    return follow(model.dynamics(belief), past.next_obs[:, -1], actions)

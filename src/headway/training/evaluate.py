@@ -12,7 +12,7 @@ from jaxtyping import PRNGKeyArray
 from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import unknown_name
-from headway.planning.acting import Acting
+from headway.planning.agent import Agent
 from headway.planning.flop import plan_flop
 from headway.sim_params import SimParamSets
 from headway.task import Task
@@ -102,7 +102,7 @@ def group_episodes(
 
 
 def evaluate_agent(  # noqa: PLR0913
-    agent: Acting,
+    agent: Agent,
     environments: Environments,
     config: Config,
     groups: Sequence[str],
@@ -173,7 +173,7 @@ class Tested:
     """All settings, as they were tested."""
     iteration: int
     """The run's last finished iteration."""
-    agent: Acting
+    agent: Agent
     task: Task
     tests: Tests
 

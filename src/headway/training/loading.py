@@ -5,7 +5,7 @@ import jax
 
 from headway.config import Config
 from headway.experiment.learners import Learned, Learner, make_learner
-from headway.planning.acting import Acting
+from headway.planning.agent import Agent
 from headway.task import Task, env_options, env_spec, episode_length
 from headway.training.collect import Environments
 from headway.training.methods import check_options
@@ -41,7 +41,7 @@ def load_learned(run: RunDir, config: Config) -> Learned:
 
 def load_agent(
     run: RunDir, config: Config | None = None, environments: Environments | None = None
-) -> Acting:
+) -> Agent:
     """The agent of a run, as trained so far.
 
     Args:

@@ -16,9 +16,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scipy import stats
 
 from headway.data import Trajectory, sim_params_row
-from headway.planning.agent import Agent, choose_heads, encode
-from headway.planning.heads import RecentTransitions
-from headway.planning.last_layer.learning import Learned, learn
+from headway.models.base import Transition
+from headway.planning.agent import Agent
+from headway.planning.heads import MultiHeadBelief, MultiHeadModel
 from headway.planning.last_layer.regression import Seen, foresee
 
 LEVELS = (0.5, 0.9, 0.95)  # central intervals that are counted
@@ -116,107 +116,65 @@ def examine(
     """
     chosen = [trajectory for trajectory in trajectories if len(trajectory) > 1]
     longest = max((len(trajectory) for trajectory in chosen), default=0)
+    assert isinstance(agent.model, MultiHeadModel)
     return [
-        _examine(agent, trajectory, longest, jax.random.fold_in(key, i))
+        _examine(agent.model, trajectory, longest, jax.random.fold_in(key, i))
         for i, trajectory in enumerate(chosen)
     ]
 
 
 def _examine(
-    agent: Agent, trajectory: Trajectory, longest: int, key: PRNGKeyArray
+    model: MultiHeadModel, trajectory: Trajectory, longest: int, key: PRNGKeyArray
 ) -> EpisodeSelection:
-    steps = len(trajectory)
+    steps, told, names = len(trajectory), None, model.sim_param_names
     padding = ((0, longest - steps), (0, 0))
     obs = jnp.asarray(np.pad(trajectory.obs, padding, "edge"))
     action = jnp.asarray(np.pad(trajectory.action, padding, "edge"))
-    told, names = None, agent.sim_param_names
     if names:
-        told = jnp.broadcast_to(sim_params_row(trajectory.sim_params, names), (longest, len(names)))
-    found = _predict(agent, obs, action, told, key)
+        told = jnp.asarray(sim_params_row(trajectory.sim_params, names))[None]
+    found = _predict(model, obs, action, told, key)
     errors, chosen, deviations = jax.tree.map(lambda x: np.asarray(x)[1:steps], found)
     if deviations is not None:
-        varies = np.asarray(agent.statistics.delta.std) > 0
+        varies = np.asarray(model.statistics.delta.std) > 0
         deviations = deviations[..., varies]
     return EpisodeSelection(trajectory.sim_params, errors, chosen, deviations)
 
 
 @eqx.filter_jit
 def _predict(
-    agent: Agent,
+    model: MultiHeadModel,
     obs: Float[Array, "time_plus_1 obs"],
     action: Float[Array, "time action"],
-    sim_params: Float[Array, "time sim_param"] | None,
+    sim_params: Float[Array, "1 sim_param"] | None,
     key: PRNGKeyArray,
 ) -> tuple[
     Float[Array, "time member head"],
     Int[Array, "time member"],
     Float[Array, "time member obs"] | None,
 ]:
-    """Errors of all heads, the selected ones, and the latter's errors in standard deviations."""
-    recent = _pasts(agent, obs, action)
-    context = encode(agent, recent, sim_params)
-    transition = obs[:-1], action, obs[1:]
-    seen = Seen.through(agent.model, agent.task, agent.statistics, transition, context)
-    chosen, foreseen = _live(agent, recent, context, seen, key)
-    difference = seen.residual - foreseen
-    errors = jnp.square(difference).mean(-1)
-    if seen.logvar is None:
-        return errors, chosen, None
+    """Errors of all heads, the selected ones, and the latter's errors in standard deviations.
 
-    def of_chosen(values: Float[Array, "time member head obs"]) -> Float[Array, "time member obs"]:
-        return jnp.take_along_axis(values, chosen[:, :, None, None], axis=2)[:, :, 0]
-
-    std = jnp.exp(0.5 * of_chosen(seen.logvar))
-    return errors, chosen, of_chosen(difference) / std
-
-
-def _live(
-    agent: Agent,
-    recent: RecentTransitions,
-    context: Float[Array, "member time context"] | None,
-    seen: Seen,
-    key: PRNGKeyArray,
-) -> tuple[
-    Int[Array, "time member"],
-    Float[Array, "time member head obs"],
-]:
-    """Go through an episode as the agent does: learn from each step, then select.
-
-    Args:
-        agent: The agent.
-        recent: What it remembers before each step; steps take the place of environments.
-        context: The context at each step.
-        seen: The transition that each step leads to.
-        key: Draws of a selection that is random or sampled.
-
-    Returns:
-        The selected heads, and how much the heads' corrections add to what they predict; 0 for
-        heads that do not learn.
+    Those of the first step mean nothing, because nothing was observed before it.
     """
-    steps = jnp.arange(len(recent.count))
 
-    def step(learned: Learned, time: Int[Array, ""]):
-        now, known = jax.tree.map(lambda x: x[time][None], (recent, seen))
-        told = None if context is None else context[:, time][:, None]
-        learned = learn(agent, learned, now, told, time[None] > 0)
-        head_key, error_key = jax.random.split(jax.random.fold_in(key, time))
-        heads = choose_heads(agent, now, told, error_key=error_key, head_key=head_key)
-        added = jnp.zeros_like(known.residual)
-        if learned.layer is not None:
-            added = foresee(learned.layer, known.features)
-        return learned, (heads[0], added[0])
+    def step(belief: MultiHeadBelief, now):
+        time, obs, action, next_obs = jax.tree.map(lambda x: x[None], now)
+        transition = Transition(obs, action, next_obs, jnp.ones(1, bool))
+        args = model.net, model.task, model.statistics, transition[:3], belief.context
+        seen, heads = Seen.through(*args), belief.heads
+        difference = seen.residual[0]
+        if belief.learned.layer is not None:
+            difference = difference - foresee(belief.learned.layer, seen.features)[0]
+        deviation = None
+        if seen.logvar is not None:
+            scaled = difference * jnp.exp(-0.5 * seen.logvar[0])
+            deviation = jnp.take_along_axis(scaled, heads[0][:, None, None], axis=1)[:, 0]
+        found = jnp.square(difference).mean(-1), heads[0], deviation
+        keys = jax.random.split(jax.random.fold_in(key, time[0] + 1))
+        return model.observe(belief, transition, keys), found
 
-    return jax.lax.scan(step, Learned.nothing(agent, 1), steps)[1]
-
-
-def _pasts(
-    agent: Agent, obs: Float[Array, "time_plus_1 obs"], action: Float[Array, "time action"]
-) -> RecentTransitions:
-    """What the agent remembers before each step of an episode; steps take the place of envs."""
-    slots = max(agent.history_length, agent.planner.selection_length)
-    steps = jnp.arange(len(action))
-    index = jnp.maximum(steps[:, None] - slots + jnp.arange(slots), 0)
-    return RecentTransitions(obs[index], action[index], obs[index + 1], steps.astype(jnp.int32))
+    steps = jnp.arange(len(action)), obs[:-1], action, obs[1:]
+    return jax.lax.scan(step, model.init_belief(1, sim_params), steps)[1]
 
 
 def summarise(episodes: Sequence[EpisodeSelection], window: int) -> SelectionSummary:

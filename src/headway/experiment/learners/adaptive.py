@@ -5,21 +5,19 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
-import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from headway.config import GradientAdaptedConfig
 from headway.data import Trajectory
 from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
-from headway.models.adapted import MetaSetup, ReluNet, meta_epoch
-from headway.models.dynamics import Statistics
+from headway.models.base import Model
 from headway.models.fitting import FitData
-from headway.models.recurrent import RecurrentNet, RecurrentSetup, recurrent_epoch
+from headway.models.grbal import GrBAL, MetaSetup, ReluNet, meta_epoch
+from headway.models.multi_headed import Statistics
+from headway.models.rebal import ReBAL, RecurrentNet, RecurrentSetup, recurrent_epoch
 from headway.models.updates import EpochStats, Fitted
-from headway.planning.meta.agent import AdaptiveAgent, imagine
-from headway.planning.meta.models import AdaptiveModel, GradientAdapted, Recurrent
+from headway.planning.agent import Agent
 from headway.training.collect import Environments
-from headway.training.diagnostics import imagined_error
 
 
 class Adaptive(Learner):
@@ -36,13 +34,8 @@ class Adaptive(Learner):
         """Go once through the data."""
 
     @abc.abstractmethod
-    def acting_model(self, learned: Learned) -> AdaptiveModel:
+    def acting_model(self, learned: Learned) -> Model:
         """The model as it acts."""
-
-    @property
-    @abc.abstractmethod
-    def memory_length(self) -> int:
-        """Past transitions that the model's state can depend on."""
 
     def initial(self, key: PRNGKeyArray) -> Learned:
         """See `Learner.initial`."""
@@ -67,26 +60,10 @@ class Adaptive(Learner):
         learned: Learned,
         environments: Environments | None = None,
         trajectories: Sequence[Trajectory] = (),
-    ) -> AdaptiveAgent:
+    ) -> Agent:
         """See `Learner.agent`."""
         del environments, trajectories
-        return AdaptiveAgent(self.acting_model(learned), self.task, self.config.planner)
-
-    def prediction_error(
-        self, learned: Learned, trajectories: list[Trajectory], key: PRNGKeyArray
-    ) -> Float[np.ndarray, " step"]:
-        """See `Learner.prediction_error`."""
-        del key
-        planner, agent = self.config.planner, self.agent(learned)
-        # The same moments as for models with heads, whatever this one remembers.
-        first = max(self.config.model.history_length, planner.selection_length)
-        return imagined_error(
-            lambda recent, actions, _: imagine(agent, recent, actions),
-            trajectories,
-            planner.horizon,
-            slots=self.memory_length,
-            first=first,
-        )
+        return Agent(self.acting_model(learned), self.task, self.config.planner)
 
 
 class GradientAdaptation(Adaptive):
@@ -103,11 +80,6 @@ class GradientAdaptation(Adaptive):
         length, rate = model.adaptation_length, model.adaptation_rate
         return MetaSetup(self.task, self.config.fitting, length, rate)
 
-    @property
-    def memory_length(self) -> int:
-        """See `Adaptive.memory_length`."""
-        return self.config.model.adaptation_length
-
     def draw_net(self, key: PRNGKeyArray) -> ReluNet:
         """See `Adaptive.draw_net`."""
         return ReluNet.init(self.config.model, self.task, key=key)
@@ -118,21 +90,14 @@ class GradientAdaptation(Adaptive):
         """See `Adaptive.fit_epoch`."""
         return meta_epoch(state, self.setup, data, key=key)
 
-    def acting_model(self, learned: Learned) -> GradientAdapted:
+    def acting_model(self, learned: Learned) -> GrBAL:
         """See `Adaptive.acting_model`."""
         setup = self.setup
-        return GradientAdapted(
-            learned.fit.model, learned.statistics, self.task, setup.length, setup.rate
-        )
+        return GrBAL(learned.fit.model, learned.statistics, self.task, setup.length, setup.rate)
 
 
 class Recurrence(Adaptive):
     """ReBAL: a recurrent network (learning_to_adapt, `rnn_dynamics.py`)."""
-
-    @property
-    def memory_length(self) -> int:
-        """See `Adaptive.memory_length`; the whole episode."""
-        return self.episode_length
 
     def draw_net(self, key: PRNGKeyArray) -> RecurrentNet:
         """See `Adaptive.draw_net`."""
@@ -145,6 +110,6 @@ class Recurrence(Adaptive):
         setup = RecurrentSetup(self.task, self.config.fitting)
         return recurrent_epoch(state, setup, data, key=key)
 
-    def acting_model(self, learned: Learned) -> Recurrent:
+    def acting_model(self, learned: Learned) -> ReBAL:
         """See `Adaptive.acting_model`."""
-        return Recurrent(learned.fit.model, learned.statistics, self.task)
+        return ReBAL(learned.fit.model, learned.statistics, self.task)

@@ -9,12 +9,13 @@ from jaxtyping import Float, PRNGKeyArray
 
 from headway.config import Config, override
 from headway.data import Episodes, Samples, Trajectory
-from headway.models.dynamics import Statistics
 from headway.models.fitting import FitData, make_data
+from headway.models.multi_headed import Statistics
 from headway.models.updates import EpochStats
-from headway.planning.acting import Acting
+from headway.planning.agent import Agent
 from headway.task import Task
 from headway.training.collect import Environments
+from headway.training.diagnostics import prediction_error
 from headway.training.methods import told_sim_params
 
 
@@ -70,7 +71,7 @@ class Learner(abc.ABC):
         learned: Learned,
         environments: Environments | None = None,
         trajectories: Sequence[Trajectory] = (),
-    ) -> Acting:
+    ) -> Agent:
         """The agent that acts with what was learned.
 
         Args:
@@ -110,6 +111,10 @@ class Learner(abc.ABC):
         )
         return make_data(episodes, samples, statistics, fitting, num_members=num_members, key=key)
 
+    def frozen(self, learned: Learned) -> Agent:
+        """The agent with the model as it was fitted; nothing of it learns while acting."""
+        return self.agent(learned)
+
     def slower(self, factor: float) -> Self:
         """The same, but learning with smaller steps."""
         rate = max(1e-12, factor * self.config.fitting.learning_rate)
@@ -134,5 +139,9 @@ class Learner(abc.ABC):
         self, learned: Learned, trajectories: list[Trajectory], key: PRNGKeyArray
     ) -> Float[np.ndarray, " step"]:
         """Error by imagined step over some episodes; empty where nothing was learned."""
-        del learned, trajectories, key
-        return np.zeros(0)
+        if not self.learns:
+            return np.zeros(0)
+        # The same moments for every kind of model, whatever it remembers.
+        planner = self.config.planner
+        first = max(self.config.model.history_length, planner.selection_length)
+        return prediction_error(self.frozen(learned), trajectories, first=first, key=key)

@@ -10,12 +10,13 @@ from jaxtyping import Float, PRNGKeyArray
 
 from headway.data import Episodes, Trajectory
 from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
-from headway.models.dynamics import MultiHeadDynamics, Statistics
 from headway.models.fitting import FitSetup, FitState, episode_losses, fit_epoch
+from headway.models.multi_headed import MultiHeadDynamics, Statistics
 from headway.planning.agent import Agent
+from headway.planning.heads import MultiHeadModel
 from headway.planning.last_layer.prior import fit_prior
 from headway.training.collect import Environments
-from headway.training.diagnostics import head_shares, prediction_error
+from headway.training.diagnostics import head_shares
 from headway.training.methods import told_sim_params
 
 
@@ -75,13 +76,15 @@ class MultiHeaded(Learner):
                 history_length=history_length,
                 horizon=planner.horizon,
             )
-        return Agent(model, statistics, self.task, planner, history_length, prior)
+        acting = MultiHeadModel(model, statistics, self.task, planner, history_length, prior)
+        return Agent(acting, self.task, planner)
 
     def frozen(self, learned: Learned) -> Agent:
-        """The agent whose heads stay as they were fitted."""
+        """See `Learner.frozen`."""
         planner = dataclasses.replace(self.config.planner, adaptation="none")
         model, length = learned.fit.model, self.config.model.history_length
-        return Agent(model, learned.statistics, self.task, planner, length)
+        acting = MultiHeadModel(model, learned.statistics, self.task, planner, length)
+        return Agent(acting, self.task, planner)
 
     def head_losses(
         self, learned: Learned, trajectories: list[Trajectory]
@@ -99,9 +102,3 @@ class MultiHeaded(Learner):
         """See `Learner.head_shares`."""
         model, statistics, episodes = learned.fit.model, learned.statistics, self.pad(trajectories)
         return head_shares(model, statistics, self.setup, trajectories, episodes)
-
-    def prediction_error(
-        self, learned: Learned, trajectories: list[Trajectory], key: PRNGKeyArray
-    ) -> Float[np.ndarray, " step"]:
-        """See `Learner.prediction_error`."""
-        return prediction_error(self.frozen(learned), trajectories, key=key)

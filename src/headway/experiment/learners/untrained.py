@@ -7,7 +7,7 @@ from jaxtyping import PRNGKeyArray
 from headway.data import Trajectory
 from headway.errors import ConfigError
 from headway.experiment.learners.base import Fit, Learned, Learner
-from headway.planning.acting import Acting, RandomAgent
+from headway.planning.agent import Agent
 from headway.training.collect import Environments
 
 
@@ -38,10 +38,10 @@ class Random(Untrained):
         learned: Learned,
         environments: Environments | None = None,
         trajectories: Sequence[Trajectory] = (),
-    ) -> Acting:
+    ) -> Agent:
         """See `Learner.agent`."""
         del learned, environments, trajectories
-        return RandomAgent(self.task)
+        return Agent(None, self.task, self.config.planner)
 
 
 class Simulator(Untrained):
@@ -52,7 +52,7 @@ class Simulator(Untrained):
         learned: Learned,
         environments: Environments | None = None,
         trajectories: Sequence[Trajectory] = (),
-    ) -> Acting:
+    ) -> Agent:
         """See `Learner.agent`.
 
         Raises:
@@ -64,8 +64,17 @@ class Simulator(Untrained):
                 "a run on the true dynamics has no controller of its own, allowed: testing it in"
                 " its simulator; use `headway evaluate`."
             )
-        from headway.experiment.true_dynamics import SimulatorAgent, make_simulator
+        from headway.envs.built_in import ClassicVectorEnv, RobotVectorEnv
+        from headway.envs.futures import RobotFutures
+        from headway.models.simulator import ClassicSimulator, RobotSimulator
 
-        return SimulatorAgent(
-            make_simulator(environments, self.config.planner), self.config.planner
-        )
+        if isinstance(environments.vector, ClassicVectorEnv):
+            model = ClassicSimulator(environments.vector, self.task)
+        elif isinstance(environments.vector, RobotVectorEnv):
+            model = RobotSimulator(RobotFutures(environments.vector), self.task)
+        else:
+            raise ConfigError(
+                f"{self.config.env} has no simulator to plan with, allowed: the built-in"
+                " environments; choose another method than true-dynamics."
+            )
+        return Agent(model, self.task, self.config.planner)

@@ -4,9 +4,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from headway.planning.heads import RecentTransitions
+from headway.models.base import Transition
 from headway.planning.last_layer.regression import (
     LastLayer,
     Observed,
@@ -20,7 +20,7 @@ from headway.planning.last_layer.regression import (
 from headway.planning.optimizers import where_env
 
 if TYPE_CHECKING:
-    from headway.planning.agent import Agent
+    from headway.planning.heads import MultiHeadModel
 
 Context = Float[Array, "member env context"] | None
 
@@ -38,48 +38,45 @@ class Learned(NamedTuple):
     """Evidence that the physics has changed, as a log Bayes factor; never below 0."""
 
     @classmethod
-    def nothing(cls, agent: "Agent", num_envs: int) -> "Learned":
+    def nothing(cls, model: "MultiHeadModel", num_envs: int) -> "Learned":
         """At the start of an episode."""
         layer = suspicion = None
-        if agent.prior is not None and agent.planner.adaptation != "none":
-            layer = untaught(agent, agent.prior, num_envs)
-            if agent.planner.change_threshold:
+        if model.prior is not None and model.planner.adaptation != "none":
+            layer = untaught(model, model.prior, num_envs)
+            if model.planner.change_threshold:
                 suspicion = jnp.zeros(num_envs)
         return cls(layer, suspicion)
 
 
-def untaught(agent: "Agent", prior: Prior, num_envs: int) -> LastLayer:
+def untaught(model: "MultiHeadModel", prior: Prior, num_envs: int) -> LastLayer:
     """The corrections before the first transition of an episode."""
-    _, num_heads, head_size, obs_size = agent.model.forward_net.mean_heads.weight.shape
+    _, num_heads, head_size, obs_size = model.net.forward_net.mean_heads.weight.shape
     return LastLayer.of_prior(prior, num_envs, (num_heads, head_size + 1, obs_size))
 
 
 def learn(
-    agent: "Agent",
+    model: "MultiHeadModel",
     learned: Learned,
-    recent: RecentTransitions,
+    transition: Transition,
     context: Context,
-    happened: Bool[Array, " env"],
 ) -> Learned:
     """Learn from the newest transition of every environment.
 
     Args:
-        agent: The agent.
+        model: The networks, their prior, and when the physics count as changed.
         learned: What was learned before.
-        recent: The newest transition is in the last slot.
+        transition: What was observed.
         context: The context vectors that the heads plan with.
-        happened: Where there was a transition.
     """
-    if agent.prior is None or learned.layer is None:
+    if model.prior is None or learned.layer is None:
         return learned
-    newest = recent.obs[:, -1], recent.action[:, -1], recent.next_obs[:, -1]
-    seen = Seen.through(agent.model, agent.task, agent.statistics, newest, context)
-    observed = Observed.of(seen, happened)
-    return Learned(*teach(agent, agent.prior, observed, learned.layer, learned.suspicion))
+    seen = Seen.through(model.net, model.task, model.statistics, transition[:3], context)
+    observed = Observed.of(seen, transition.happened)
+    return Learned(*teach(model, model.prior, observed, learned.layer, learned.suspicion))
 
 
 def teach(
-    agent: "Agent",
+    model: "MultiHeadModel",
     prior: Prior,
     observed: Observed,
     layer: LastLayer,
@@ -97,12 +94,12 @@ def teach(
     if suspicion is not None:
         happened = observed.learned_from[..., None]
         likelihood = happened * log_likelihood(expected, layer, prior)
-        anew = untaught(agent, prior, len(suspicion))
+        anew = untaught(model, prior, len(suspicion))
         first = happened * log_likelihood(forecast(anew, observed), anew, prior)
         unexpected = surprise(first, likelihood)
-        most = agent.planner.change_threshold / (CONFIRMATIONS - 0.5)
+        most = model.planner.change_threshold / (CONFIRMATIONS - 0.5)
         suspicion = suspicion + jnp.minimum(unexpected, most)
-        changed = suspicion > agent.planner.change_threshold
+        changed = suspicion > model.planner.change_threshold
         suspicion = jnp.where(changed, 0.0, jnp.maximum(suspicion, 0.0))
         layer = where_env(changed, anew, layer)
         expected = forecast(layer, observed)

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from headway.data import Trajectory
 from headway.errors import ConfigError
-from headway.models.dynamics import MultiHeadDynamics, Statistics
+from headway.models.multi_headed import MultiHeadDynamics, Statistics
 from headway.planning.last_layer import foresight
 from headway.planning.last_layer.evidence import Evidence
 from headway.planning.last_layer.regression import Prior, Shape

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from headway.data import Episodes
-from headway.models.dynamics import MultiHeadDynamics, Statistics, network_input
+from headway.models.multi_headed import MultiHeadDynamics, Statistics, network_input
 from headway.task import Task
 
 BELIEVABLE = 100.0

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from headway.data import Episodes, Trajectory
-from headway.models.dynamics import MultiHeadDynamics, Statistics
+from headway.models.multi_headed import MultiHeadDynamics, Statistics
 from headway.planning.last_layer.regression import (
     Seen,
     heads_by_error,

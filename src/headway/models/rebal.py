@@ -1,4 +1,4 @@
-"""ReBAL's network: a recurrent one, fitted by truncated backpropagation through time.
+"""ReBAL: a recurrent network, fitted by truncated backpropagation through time.
 
 Nagabandi et al., "Learning to adapt in dynamic, real-world environments through
 meta-reinforcement learning" (2019).
@@ -11,10 +11,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from headway.config import FittingConfig, ModelConfig
-from headway.models.adapted import Window, glorot
+from headway.config import FittingConfig, ModelConfig, Precision
+from headway.models.base import Dynamics, Keys, Layer, Model, Transition, plan_layers
 from headway.models.compilation import jit_networks
 from headway.models.fitting import FitData
+from headway.models.grbal import Window, glorot, next_obs, wide_input
+from headway.models.multi_headed import Statistics, network_input
 from headway.models.networks import Dense
 from headway.models.updates import EpochStats, Fitted, Tally
 from headway.task import Task
@@ -184,3 +186,63 @@ def whole_episodes(
     valid = jnp.arange(action.shape[1]) < episodes.length[chosen][:, None]
     weight = (valid & counted[:, None]).astype(jnp.float32)
     return Window.of(setup.task, data.statistics, (obs[:, :-1], action, obs[:, 1:]), weight)
+
+
+class ReBAL(Model):
+    """A recurrent network, whose state is what it remembers of the episode."""
+
+    net: RecurrentNet
+    statistics: Statistics
+    task: Task
+
+    def init_belief(self, num_envs: int, sim_params: None = None) -> tuple[CellState, ...]:
+        """See `Model.init_belief`."""
+        del sim_params
+        return self.net.start(num_envs)
+
+    def observe(
+        self, belief: tuple[CellState, ...], transition: Transition, keys: Keys
+    ) -> tuple[CellState, ...]:
+        """See `Model.observe`; the state goes on by the action that was taken."""
+        del keys
+        x = network_input(self.task, self.statistics, transition.obs, transition.action)
+        after, _ = self.net(belief, x)
+        happened = transition.happened[:, None]
+        return jax.tree.map(lambda new, old: jnp.where(happened, new, old), after, belief)
+
+    def dynamics(
+        self, belief: tuple[CellState, ...], precision: Precision = "float32"
+    ) -> "RecurrentDynamics":
+        """See `Model.dynamics`."""
+        layers = plan_layers((*self.net.layers, self.net.output), precision)
+        return RecurrentDynamics(belief, layers, self.statistics, self.task)
+
+
+class RecurrentDynamics(Dynamics):
+    """A recurrent network whose state goes on with every imagined step."""
+
+    own: tuple[CellState, ...]
+    layers: tuple[Layer, ...]
+    statistics: Statistics
+    task: Task
+
+    @property
+    def widest(self) -> int:
+        """See `Dynamics.widest`."""
+        return max(layer.bias.shape[-1] for layer in self.layers)
+
+    def start(self) -> tuple[CellState, ...]:
+        """See `Dynamics.start`."""
+        return jax.tree.map(lambda x: x[None], self.own)
+
+    def step(self, carry, obs, action, noise):
+        """See `Dynamics.step`."""
+        del noise
+        x = wide_input(self.task, self.statistics, obs, action)
+        *layers, output = self.layers
+        states = []
+        for layer, before in zip(layers, carry, strict=True):
+            gates = layer(jnp.concatenate([x, before.hidden], axis=1))
+            states.append(next_cell(before, gates, axis=1))
+            x = states[-1].hidden
+        return tuple(states), next_obs(self.task, self.statistics, obs, output(x))

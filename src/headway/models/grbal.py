@@ -1,10 +1,11 @@
-"""GrBAL's network and meta-learning: weights from which one gradient step adapts.
+"""GrBAL: meta-learned weights, from which one gradient step adapts to the present episode.
 
 Nagabandi et al., "Learning to adapt in dynamic, real-world environments through
 meta-reinforcement learning" (2019); model-agnostic meta-learning, Finn et al. (2017). Fact
 sheet E.9.
 """
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -12,11 +13,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from headway.config import FittingConfig, ModelConfig
+from headway.config import FittingConfig, ModelConfig, Precision
 from headway.data import Episodes
+from headway.models.base import (
+    Dynamics,
+    Keys,
+    Layer,
+    Model,
+    RecentTransitions,
+    Transition,
+    over_rows,
+    plan_layers,
+)
 from headway.models.compilation import jit_networks
-from headway.models.dynamics import Statistics, network_input
 from headway.models.fitting import FitData
+from headway.models.multi_headed import Statistics, network_input
 from headway.models.networks import Dense
 from headway.models.updates import EpochStats, Fitted, Tally
 from headway.task import Task
@@ -191,3 +202,91 @@ def glorot(key: PRNGKeyArray, shape: tuple[int, ...]) -> Array:
     """Uniform draws of variance 2 / (in + out), [..., in, out] (Glorot and Bengio, 2010)."""
     limit = (6.0 / (shape[-2] + shape[-1])) ** 0.5
     return jax.random.uniform(key, shape, minval=-limit, maxval=limit)
+
+
+class GrBAL(Model):
+    """One gradient step on the newest transitions, from the meta-learned weights.
+
+    Until an episode has `length` transitions, the meta-learned weights themselves predict.
+    """
+
+    net: ReluNet
+    statistics: Statistics
+    task: Task
+    length: int = eqx.field(static=True)
+    rate: float = eqx.field(static=True)
+
+    @property
+    def memory(self) -> int:
+        """See `Model.memory`."""
+        return self.length
+
+    def init_belief(self, num_envs: int, sim_params: None = None) -> RecentTransitions:
+        """See `Model.init_belief`: the transitions to adapt to."""
+        del sim_params
+        return RecentTransitions.empty(num_envs, self.length, self.task)
+
+    def observe(
+        self, belief: RecentTransitions, transition: Transition, keys: Keys
+    ) -> RecentTransitions:
+        """See `Model.observe`."""
+        del keys
+        return belief.push(transition)
+
+    def dynamics(
+        self, belief: RecentTransitions, precision: Precision = "float32"
+    ) -> "AdaptedDynamics":
+        """See `Model.dynamics`: the weights of every environment, adapted."""
+        past = Window.of(self.task, self.statistics, belief[:3], jnp.ones(belief.obs.shape[:2]))
+        adapted = jax.vmap(lambda past: adapt(self.net, past, self.rate))(past)
+        enough = belief.count >= self.length
+
+        def choose(adapted, meta_learned):
+            return jnp.where(enough.reshape(-1, *[1] * meta_learned.ndim), adapted, meta_learned)
+
+        net = jax.tree.map(choose, adapted, self.net)
+        layers = plan_layers((*net.hidden, net.output), precision)
+        return AdaptedDynamics(layers, self.statistics, self.task)
+
+
+class AdaptedDynamics(Dynamics):
+    """A plain network whose weights differ between environments."""
+
+    own: tuple[Layer, ...]
+    statistics: Statistics
+    task: Task
+
+    @property
+    def widest(self) -> int:
+        """See `Dynamics.widest`."""
+        return max(layer.bias.shape[-1] for layer in self.own)
+
+    def step(self, carry, obs, action, noise):
+        """See `Dynamics.step`."""
+        del noise
+        x = wide_input(self.task, self.statistics, obs, action)
+        *hidden, output = self.own
+        for layer in hidden:
+            x = jax.nn.relu(layer(x))
+        return carry, next_obs(self.task, self.statistics, obs, output(x))
+
+
+def wide_input(
+    task: Task,
+    statistics: Statistics,
+    obs: Float[Array, "1 obs particle candidate"],
+    action: Float[Array, "1 action particle candidate"],
+) -> Float[Array, "1 in particle candidate"]:
+    """`network_input` in the layout of a plan."""
+    return over_rows(functools.partial(network_input, task, statistics))(obs, action)
+
+
+def next_obs(
+    task: Task,
+    statistics: Statistics,
+    obs: Float[Array, "1 obs particle candidate"],
+    normalized: Float[Array, "1 obs particle candidate"],
+) -> Float[Array, "1 obs particle candidate"]:
+    """Where a predicted, normalised `delta` leads, in the layout of a plan."""
+    delta = over_rows(statistics.delta.denormalize)(normalized)
+    return over_rows(task.postprocess)(obs, delta)

@@ -1,0 +1,254 @@
+"""Cores that share the candidates of a plan choose what one program would choose; their noise."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import toys
+from headway.config import CEMConfig, ICEMConfig, MPPIConfig, PlannerConfig, RandomShootingConfig
+from headway.planning import cpu
+from headway.planning.cpu import Shard, in_shards, joined, normal_block, threefry2x32
+from headway.planning.deadline import DeadlinePlanner
+from headway.planning.rollouts import candidate_returns
+
+TINY = PlannerConfig(
+    horizon=5,
+    num_candidates=40,
+    optimizer=CEMConfig(num_elites=8),
+    num_iterations=3,
+    num_particles=4,
+)
+OBS = np.ones((3, 2), np.float32)
+
+
+def make_agent(**settings):
+    return toys.make_agent(toys.small_model(seed=3), dataclasses.replace(TINY, **settings))
+
+
+def actions(agent, num_envs=3, steps=3):
+    state = agent.init(num_envs, key=jax.random.key(0))
+    obs = np.random.default_rng(1).normal(size=(steps, num_envs, 2)).astype(np.float32)
+    found = []
+    for one in obs:
+        state, decision = agent.act(state, one)
+        found.append(np.asarray(decision.action))
+    return np.stack(found)
+
+
+@pytest.fixture
+def sharing(monkeypatch):
+    """Plans of any size are shared by three cores."""
+    monkeypatch.setattr(cpu, "LEAST_STEPS", 1)
+    monkeypatch.setattr(cpu, "num_cpus", lambda: 3)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"num_candidates": 41},
+        {"precision": "bfloat16"},
+        {"particle_noise": "shared"},
+        {"optimizer": ICEMConfig(num_elites=4)},
+        {"optimizer": MPPIConfig()},
+        {"optimizer": RandomShootingConfig()},
+    ],
+    ids=str,
+)
+def test_cores_that_share_a_plan_choose_the_actions_of_one_program(settings, sharing, monkeypatch):
+    agent = make_agent(**settings)
+    shared = actions(agent)
+    monkeypatch.setattr(cpu, "LEAST_STEPS", np.inf)
+    np.testing.assert_allclose(shared, actions(agent), atol=1e-5)
+
+
+@pytest.mark.parametrize("caches", [1, cpu.CACHES_OF_CORE], ids=["in turns", "side by side"])
+@pytest.mark.parametrize(("shards", "noise"), [(2, "independent"), (4, "shared"), (40, "shared")])
+def test_shards_have_the_returns_of_the_whole(shards, noise, caches, monkeypatch):
+    monkeypatch.setattr(cpu, "CACHES_OF_CORE", caches)
+    agent, rng = make_agent(particle_noise=noise), np.random.default_rng(3)
+    context = jnp.asarray(rng.normal(size=(2, 3, 3)), jnp.float32)
+    heads = jnp.asarray(rng.integers(0, 2, (3, 2)))
+    belief = agent.model.init_belief(3)._replace(context=context, heads=heads)
+    candidates = jnp.asarray(rng.uniform(-1, 1, (3, 7, 4, 2)), jnp.float32)
+    args = agent.model.dynamics(belief), toys.POINT, jnp.asarray(OBS), candidates
+    returns_of = eqx.filter_jit(
+        lambda shard: candidate_returns(
+            *args, planner=agent.planner, key=jax.random.key(1), shard=shard
+        )
+    )
+    found = joined(in_shards(returns_of, 7, shards), 7)
+    whole = returns_of(None)
+    np.testing.assert_allclose(found, whole, rtol=1e-5)
+    assert len(np.unique(whole)) == whole.size
+
+
+def test_a_deadline_planner_shares_its_iterations(sharing, monkeypatch):
+    agent = make_agent()
+    state = agent.init(1, key=jax.random.key(0))
+    outcome = DeadlinePlanner(agent, 1000.0).act(state, OBS[:1], started=0.0, at_least=3)
+    monkeypatch.setattr(cpu, "LEAST_STEPS", np.inf)
+    _, whole = agent.act(state, OBS[:1])
+    assert outcome.complete
+    np.testing.assert_allclose(outcome.decision.action, whole.action, atol=1e-5)
+
+
+def test_number_of_shards(monkeypatch):
+    monkeypatch.setattr(cpu, "num_cpus", lambda: 4)
+    monkeypatch.setattr(cpu, "LEAST_STEPS", 100)
+    assert [cpu.num_shards(100 * n) for n in (0, 1, 2, 3, 4, 5, 100)] == [1, 1, 2, 3, 4, 4, 4]
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert cpu.num_shards(10_000) == 1
+
+
+def test_a_step_that_is_part_of_another_program_is_one_program(sharing):
+    agent = make_agent()
+    state = agent.init(1, key=jax.random.key(0))
+    keys = jax.random.split(jax.random.key(1), 2)
+
+    def action(key):
+        return agent.act(state._replace(key=key), OBS[:1])[1].action
+
+    found = jax.vmap(action)(keys)
+    np.testing.assert_allclose(found, [action(key) for key in keys], atol=1e-5)
+
+
+def test_environments_are_spread_evenly_over_chunks_that_fit():
+    sizes = [cpu.environments_at_once(10, size, budget=100) for size in (10, 11, 30, 1000)]
+    assert sizes == [10, 5, 3, 1]
+
+
+def test_shards_do_not_wait_for_threads_that_are_busy(monkeypatch):
+    free = threading.Event()
+    with ThreadPoolExecutor(1) as busy:
+        monkeypatch.setattr(cpu, "_threads", lambda: busy)
+        busy.submit(free.wait, 60)
+        found = in_shards(lambda shard: jnp.full((1, shard.size), 1.0 * shard.first), 6, 3)
+        assert not free.is_set()
+        free.set()
+    np.testing.assert_array_equal(np.concatenate(found, 1), [[0, 0, 2, 2, 4, 4]])
+
+
+def test_an_error_in_another_thread_is_raised(monkeypatch):
+    together = threading.Barrier(2)
+
+    def fails_elsewhere(shard: Shard):
+        together.wait(60)
+        if threading.current_thread() is not threading.main_thread():
+            raise ZeroDivisionError
+        return jnp.zeros((1, shard.size))
+
+    with ThreadPoolExecutor(1) as threads:
+        monkeypatch.setattr(cpu, "_threads", lambda: threads)
+        with pytest.raises(ZeroDivisionError):
+            in_shards(fails_elsewhere, 4, 2)
+
+
+def walk(seed, steps):
+    agent = make_agent()
+    state, found = agent.init(1, key=jax.random.key(seed)), []
+    for _ in range(steps):
+        state, decision = agent.act(state, OBS[:1])
+        found.append(np.asarray(decision.action))
+    return np.stack(found)
+
+
+MANY_THREADS = """
+import sys, numpy as np
+from concurrent.futures import ThreadPoolExecutor
+from headway.planning import cpu
+from planning.test_cpu import walk
+cpu.LEAST_STEPS, cpu.num_cpus = 1, lambda: 3
+wanted = [walk(seed, 3) for seed in range(3)]
+with ThreadPoolExecutor(3) as threads:
+    found = threads.map(walk, range(3), [int(sys.argv[1])] * 3)
+print([np.array_equal(some[:3], all) for some, all in zip(found, wanted)])
+"""
+
+AFTER_THE_MAIN_THREAD = """
+import threading
+from headway.planning import cpu
+from planning.test_cpu import walk
+cpu.LEAST_STEPS, cpu.num_cpus = 1, lambda: 3
+walk(0, 1)
+def late():
+    threading.main_thread().join()
+    print(walk(0, 2).shape)
+threading.Thread(target=late).start()
+"""
+
+
+def printed_by(program, *args, seconds=120):
+    """What a Python, which can import what the tests can, has printed once it has ended well."""
+    paths = [str(Path(toys.__file__).parent), *sys.path]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *args],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+        capture_output=True,
+        text=True,
+        timeout=seconds,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout.strip()
+
+
+@pytest.mark.parametrize("plans", [60, pytest.param(2_000, marks=pytest.mark.slow)])
+def test_controllers_in_several_threads_share_the_cores_and_end(plans):
+    assert printed_by(MANY_THREADS, str(plans), seconds=max(120, plans)) == "[True, True, True]"
+
+
+def test_a_controller_may_outlive_the_main_thread():
+    assert printed_by(AFTER_THE_MAIN_THREAD) == "(2, 1, 2)"
+
+
+# The noise of imagined steps, against JAX's own generator.
+
+
+def normal(key, shape):
+    return normal_block(key, shape, [0] * len(shape), shape)
+
+
+@pytest.mark.parametrize("impl", ["threefry2x32", "rbg"])
+@pytest.mark.parametrize("shape", [(1,), (3,), (2, 7, 3), (5, 4, 2, 25), (1, 1, 1, 1)])
+def test_draws_are_those_of_jax(shape, impl):
+    key = jax.random.key(7, impl=impl)
+    np.testing.assert_array_equal(normal(key, shape), jax.random.normal(key, shape))
+
+
+def test_draws_of_many_keys_at_once_are_those_of_each():
+    keys = jax.random.split(jax.random.key(1), 3)
+    together = jax.vmap(lambda key: normal(key, (2, 5)))(keys)
+    np.testing.assert_array_equal(together, [jax.random.normal(key, (2, 5)) for key in keys])
+
+
+@pytest.mark.parametrize("impl", ["threefry2x32", "rbg"])
+def test_a_block_is_that_of_the_whole(impl):
+    key = jax.random.key(9, impl=impl)
+    whole = jax.random.normal(key, (4, 3, 2, 10))
+    block = jax.jit(lambda start: normal_block(key, whole.shape, (start, 0, 1, 5), (2, 3, 1, 4)))
+    np.testing.assert_array_equal(block(1), whole[1:3, :, 1:, 5:9])
+
+
+@pytest.mark.parametrize(
+    ("key", "counter", "block"),
+    [
+        ((0, 0), (0, 0), (0x6B200159, 0x99BA4EFE)),
+        ((2**32 - 1, 2**32 - 1), (2**32 - 1, 2**32 - 1), (0x1CB996FC, 0xBB002BE7)),
+        ((0x13198A2E, 0x03707344), (0x243F6A88, 0x85A308D3), (0xC4923A9C, 0x483DF7A0)),
+    ],
+)
+def test_known_answers_of_the_cipher(key, counter, block):
+    """Those that its authors publish with Random123 (kat_vectors, threefry 2x32, 20 rounds)."""
+    found = threefry2x32(jnp.asarray(key, jnp.uint32), *map(jnp.uint32, counter))
+    assert tuple(int(word) for word in found) == block
