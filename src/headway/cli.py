@@ -28,8 +28,9 @@ from headway.config import (
     PlannerConfig,
     flatten,
     override,
+    to_dict,
 )
-from headway.errors import ConfigError, HeadwayError, unknown_name
+from headway.errors import ConfigError, HeadwayError
 
 MAX_SEEDS = 1000
 PIPE_WIDTH = 130
@@ -109,14 +110,11 @@ class Command:
     def changed(self, config: Config) -> dict[str, Any]:
         """Settings by dotted name that differ from those of a configuration."""
         mine = {name: getattr(self, name) for name in SECTIONS if hasattr(self, name)}
-        chosen = {}
-        if mine["planner"].optimizer.name != config.planner.optimizer.name:
-            chosen = {"planner.optimizer.name": mine["planner"].optimizer.name}
-        default = override(config, chosen)
-        usual = {name: dataclasses.asdict(getattr(default, name)) for name in mine}
-        asked = {name: dataclasses.asdict(section) for name, section in mine.items()}
-        before = flatten(usual)
-        return chosen | {n: v for n, v in flatten(asked).items() if v != before[n]}
+        asked = flatten({name: dataclasses.asdict(section) for name, section in mine.items()})
+        tag = "planner.optimizer.name"
+        chosen = {} if asked[tag] == config.planner.optimizer.name else {tag: asked[tag]}
+        usual = flatten(to_dict(override(config, chosen)))
+        return chosen | {name: value for name, value in asked.items() if value != usual[name]}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,17 +161,14 @@ class Train(Command):
 
     def settings(self) -> dict[str, Any]:
         """Settings by dotted name that differ from those of method and preset."""
-        from headway.task import env_spec
         from headway.training.methods import make_config
 
         config = make_config(self.env, method=self.method, preset=self.preset)
         settings = self.changed(config)
         if self.env_options:
-            spec, options = env_spec(self.env), dict(config.env_options)
+            options = dict(config.env_options)
             for word in self.env_options:
                 name, _, value = word.replace("-", "_").partition("=")
-                if name not in spec.options:
-                    raise unknown_name(f"{spec.name} option", name, spec.options)
                 if value not in ("on", "off"):
                     raise ConfigError(f"--env-options is {word!r}, allowed: {name}=on or =off.")
                 options[name] = value == "on"

@@ -89,7 +89,7 @@ def _tagged(table: Mapping[str, type], tag: str) -> pydantic.PlainValidator:
 class ModelConfig:
     """Settings of a kind of model; where it says nothing, one network without heads or context."""
 
-    kind: str
+    kind: Any  # a Literal in each class
     learns: bool = True
     """Whether there is anything to fit."""
     num_members: int = 1
@@ -263,9 +263,9 @@ class FittingConfig:
 
 
 class OptimizerConfig:
-    """Settings of what searches for the best action sequence."""
+    """Settings of the search for the best action sequence."""
 
-    name: str
+    name: Any  # a Literal in each class
 
 
 @settings
@@ -593,7 +593,8 @@ def _in_words(error: pydantic.ValidationError) -> str:
                 str(found["input"])[:80], re.findall("'(.*?)'", allowed), n=1
             )
             hint = f" Did you mean {close[0]!r}?" if close and kind == "literal_error" else ""
-            lines.append(f"{name} is {shown(found['input'])}, allowed: {allowed}.{hint}")
+            got = f"{name or 'the settings'} is {shown(found['input'])}"
+            lines.append(f"{got}, allowed: {allowed}.{hint}")
     return " ".join(lines)
 
 

@@ -1,5 +1,7 @@
 """From settings to an optimizer."""
 
+from typing import Any
+
 from headway.config import PlannerConfig
 from headway.planning.optimizers.base import Optimizer
 from headway.planning.optimizers.cem import CEM
@@ -17,7 +19,7 @@ _OPTIMIZERS: dict[str, type[Optimizer]] = {
 
 def make_optimizer(config: PlannerConfig) -> Optimizer:
     """Build the optimizer that the settings name."""
-    own = {name: value for name, value in vars(config.optimizer).items() if name != "name"}
-    return _OPTIMIZERS[config.optimizer.name](
-        num_candidates=config.num_candidates, num_iterations=config.num_iterations, **own
-    )
+    settings: dict[str, Any] = dict(vars(config.optimizer))
+    optimizer = _OPTIMIZERS[settings.pop("name")]
+    shared = {"num_candidates": config.num_candidates, "num_iterations": config.num_iterations}
+    return optimizer(**shared, **settings)
