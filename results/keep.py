@@ -16,8 +16,8 @@ from typing import Any
 
 from headway import config as settings
 from headway.config import Config
+from headway.lab.sweep import fingerprint
 from headway.storage.iterations import manifest_name
-from headway.sweeps.jobs import fingerprint
 from headway.training.methods import make_config
 from headway.training.run import TABLES, RunDir
 

@@ -404,9 +404,9 @@ class _Runs(Command):
     """Settings as NAME=VALUE, for example collection.num_iterations=3; `headway sweep` takes
     several values, for example planner.horizon=10,20, and combines them all."""
     dry_run: Flag = False
-    """List what would be run and about how long it takes, and run nothing."""
+    """List the runs and how far each is, and run nothing."""
     one_by_one: Flag = False
-    """Let runs go one after another in this process, even where Ray is installed."""
+    """Let runs go one after another, even where Ray is installed."""
     address: Annotated[str | None, _unless_given("Ray on this machine")] = None
     """A Ray cluster, for example `auto`; it must see --out under the same path."""
     cpus_per_run: float = 1.0
@@ -416,26 +416,22 @@ class _Runs(Command):
 
     def compare(self, experiment: Any, settings: Mapping[str, Any], words: Sequence[str]) -> int:
         """Make the runs that are missing, and print what all of them found."""
-        from headway.sweeps.jobs import Comparison
+        from headway.lab.sweep import Comparison, Workers
 
         seeds = read_seeds(self.seeds)
         comparison = Comparison(experiment, self.envs, seeds, self.preset, self.out, settings)
         if self.dry_run:
-            from headway.lab.listing import plan
-            from headway.sweeps.cost import make_plan
+            from headway.lab.listing import states
 
-            planned = make_plan(comparison.jobs)
-            entries, table = plan(comparison, planned)
-            return self.show({**entries, "note": planned.note}, table, planned.note)
+            entries, table = states(comparison)
+            return self.show({"runs": entries}, table)
         from headway.lab.comparison import reproduce, results
-        from headway.sweeps.board import make_board
-        from headway.sweeps.running import Workers
 
         command = shlex.join(["headway", *words])
         done = reproduce(
             comparison,
             workers=Workers(self.one_by_one, self.address, self.cpus_per_run, self.gpus_per_run),
-            board=make_board(self.quiet),
+            quiet=self.quiet,
             command=command,
         )
         for path, reason in done.failures.items():
@@ -470,7 +466,7 @@ class Reproduce(_Runs):
 
     def run(self, words):
         """Reproduce, with one value of each setting."""
-        from headway.sweeps.experiments import experiment
+        from headway.lab.paper import experiment
 
         found = experiment(self.experiment)
         grid = read_settings(self.settings)
@@ -494,7 +490,7 @@ class Sweep(_Runs):
 
     def run(self, words):
         """Sweep; settings with several values make arms."""
-        from headway.sweeps.experiments import sweep_experiment
+        from headway.lab.paper import sweep_experiment
 
         asked = read_settings(self.settings)
         grid = {name: values for name, values in asked.items() if len(values) > 1}

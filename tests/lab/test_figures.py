@@ -12,7 +12,7 @@ from PIL import Image
 from headway.errors import RunError
 from headway.lab import figures
 from headway.lab.figures import save_run_figures
-from headway.sweeps.experiments import Arm, experiment, sweep_experiment
+from headway.lab.paper import Arm, experiment, sweep_experiment
 from headway.training.methods import METHODS
 
 ALL = ["learning_curve.png", "evaluation.png", "head_shares.png", "prediction_error.png"]

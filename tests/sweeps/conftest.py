@@ -4,13 +4,12 @@ import fakes
 import pytest
 
 from headway.lab import comparison
-from headway.sweeps import running
 
 
 @pytest.fixture
 def training(monkeypatch):
     fake = fakes.FakeTraining()
-    monkeypatch.setattr(running, "train_run", fake)
+    monkeypatch.setattr(comparison, "run_jobs", fake)
     return fake
 
 

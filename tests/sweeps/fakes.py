@@ -1,11 +1,10 @@
-"""Runs that are written instead of trained, and a board that remembers what it was told."""
+"""Runs that are small, or that are written instead of trained."""
 
 import numpy as np
 
 import runs
-from headway.errors import BusyError, DivergenceError
-from headway.sweeps.board import Board
-from headway.sweeps.jobs import Job
+from headway.errors import DivergenceError
+from headway.lab.sweep import Job
 from headway.task import sim_param_sets
 from headway.training.methods import make_config
 from headway.training.run import EpisodeRow
@@ -19,6 +18,7 @@ TINY = {
     "planner.num_candidates": 8,
     "planner.horizon": 3,
 }
+DIVERGED = DivergenceError("no finite number")
 
 
 def tiny_job(out, seed=0, **changes):
@@ -26,37 +26,22 @@ def tiny_job(out, seed=0, **changes):
     return Job.of(config, out)
 
 
-class Remembering(Board):
-    """Keeps every status in the order of its arrival."""
-
-    def __init__(self):
-        super().__init__()
-        self.told = []
-        self.messages = []
-
-    def show(self, job, before, status):
-        self.told.append((job.path, status))
-
-    def message(self, text):
-        self.messages.append(text)
-
-    def states(self, job):
-        return [status.state for path, status in self.told if path == job.path]
-
-
 class FakeTraining:
-    """Takes the place of `train_run`: writes returns that follow from method and seed."""
+    """Takes the place of `run_jobs`: writes returns that follow from method and seed."""
 
     def __init__(self):
         self.calls = []
-        self.answers = {}  # errors to raise, by seed, one per call
+        self.answers = {}  # errors, by seed, one per run
 
-    def __call__(self, config, path, progress):
-        self.calls.append((config.method, config.seed))
-        errors = self.answers.get(config.seed)
-        if errors:
-            raise errors.pop(0)
-        write_run(config, path, progress)
+    def __call__(self, jobs, workers, *, quiet=True):
+        failures = {}
+        for job in (job for job in jobs if job.state.name != "done"):
+            self.calls.append((job.config.method, job.config.seed))
+            if errors := self.answers.get(job.config.seed):
+                failures[job.path] = str(errors.pop(0))
+            else:
+                write_run(job.config, job.path)
+        return failures
 
 
 def level(config, iteration):
@@ -64,7 +49,7 @@ def level(config, iteration):
     return 10.0 * len(config.method) + config.seed + iteration
 
 
-def write_run(config, path, progress=None, keep=None):
+def write_run(config, path, keep=None):
     """Write the files that reports read; with the tests of all iterations, or of one."""
     sets = sim_param_sets(config)
     lines, rows = [], []
@@ -90,11 +75,5 @@ def write_run(config, path, progress=None, keep=None):
                 )
                 for episode, value in enumerate(returns)
             ]  # fmt: skip
-        if progress:
-            progress.iteration_done(metrics)
     kept = [row.to_csv() for row in rows if keep is None or row.iteration == keep]
     runs.write_run(path, config, lines, {"evaluation.csv": kept})
-
-
-BUSY = BusyError("held by another process")
-DIVERGED = DivergenceError("no finite number")

@@ -10,9 +10,8 @@ import pytest
 from PIL import Image
 
 from headway.lab.comparison import find, reproduce, spread, table_rows, verdicts
-from headway.sweeps.experiments import Arm, Experiment, experiment
-from headway.sweeps.jobs import Comparison
-from headway.sweeps.running import Workers
+from headway.lab.paper import Arm, Experiment, experiment
+from headway.lab.sweep import Comparison, Workers
 
 HERE = Workers(one_by_one=True)
 
@@ -135,27 +134,21 @@ def test_another_figure_reuses_the_runs(training, tmp_path):
 
 @pytest.mark.usefixtures("training", "without_figures")
 def test_a_comparison_replaces_what_it_contains_and_nothing_else(tmp_path):
-    board = fakes.Remembering()
-
     def make(**changes):
         options = {"seeds": (0,), **changes}
-        done = reproduce(comparison(tmp_path, **options), workers=HERE, board=board)
+        done = reproduce(comparison(tmp_path, **options), workers=HERE)
         return done.files[-1].parent
 
     usual = make()
     assert make() == make(seeds=(0, 1)) == make(seeds=(1, 0), envs=("hopper", "pendulum")) == usual
-    assert board.messages == []
     both = (usual / "fig13.csv").read_bytes()
     other = make(envs=("hopper",))
     assert re.fullmatch(r"fig13-smoke-[0-9a-f]{10}", other.name)
-    assert board.messages == [
-        f"{usual} holds another comparison, which stays; this one goes to {other}"
-    ]
     horizon = {"planner.horizon": 2}
     assert len({usual, other, make(envs=("slim-humanoid",)), make(**horizon)}) == 4
     assert make(envs=("hopper",)) == other
     assert (usual / "fig13.csv").read_bytes() == both
-    (usual / "comparison.json").write_text("{")
+    (usual / "comparison.json").write_text("{}")
     assert make(seeds=(0, 1), envs=("pendulum", "hopper")) != usual
 
 

@@ -11,14 +11,10 @@ from pathlib import Path
 import pandas as pd
 from rich.table import Table
 
-from headway.errors import HeadwayError
 from headway.lab import figures, tables
 from headway.lab.statistics import MIN_RUNS, caution, compare, estimate, unlike, verdict
-from headway.sweeps.board import Board
-from headway.sweeps.jobs import Cell, Comparison
-from headway.sweeps.results_folder import claim
-from headway.sweeps.running import Workers, run_jobs
-from headway.training.run import write_bytes
+from headway.lab.sweep import NOTE, Cell, Comparison, Workers, run_jobs
+from headway.training.run import write_bytes, write_json
 
 RAW_COLUMNS = [
     "experiment", "arm", "env", "method", "preset", "seed", "iteration", "timesteps", "group",
@@ -78,7 +74,7 @@ def reproduce(
     comparison: Comparison,
     *,
     workers: Workers | None = None,
-    board: Board | None = None,
+    quiet: bool = True,
     command: str = "",
 ) -> Reproduced:
     """Make every run of a comparison that is missing, and write figure, CSV and table.
@@ -90,23 +86,16 @@ def reproduce(
     Args:
         comparison: The experiment, environments, seeds and scale.
         workers: Where the runs are made; on Ray on this machine by default, where installed.
-        board: Shows how the runs stand; silent by default.
+        quiet: Say nothing on stderr.
         command: The command line that asked for this; it is written below the table.
 
     Raises:
         UnknownNameError: No such environment, method or preset.
         ConfigError: A setting is unknown, of the wrong type or out of range.
     """
-    with board or Board() as shown:
-        if comparison.folder != comparison.usual_folder:
-            shown.message(
-                f"{comparison.usual_folder} holds another comparison, which stays; this one goes to"
-                f" {comparison.folder}"
-            )
-        run_jobs(comparison.jobs, workers or Workers(), shown)
-        failures = dict(shown.failures)
+    failures = run_jobs(comparison.jobs, workers or Workers(), quiet=quiet)
     found = find(comparison)
-    claim(comparison.folder, comparison.facts)
+    write_json(comparison.folder / NOTE, comparison.facts)
     path = comparison.folder / f"{comparison.experiment.name}.csv"
     raw = found.episodes.rename(columns={"label": "arm"})
     raw["run"] = [Path(run).relative_to(comparison.out).as_posix() for run in raw["run"]]
@@ -119,11 +108,7 @@ def find(comparison: Comparison) -> Found:
     """Read the finished runs of a comparison; a damaged one counts as missing."""
     done, missing = {}, []
     for cell, job in comparison.cells.items():
-        try:
-            finished = job.finished
-        except HeadwayError:
-            finished = False
-        if finished:
+        if job.state.name == "done":
             done[cell] = str(job.path)
         else:
             missing.append(cell)

@@ -1,4 +1,4 @@
-"""What there is to name on the command line, and what a comparison would take, as tables."""
+"""What there is to name on the command line, and the runs of a comparison, as tables."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,11 +6,9 @@ from typing import Any
 from rich.table import Table
 
 from headway.config import Config, flatten, to_dict
+from headway.lab.paper import EXPERIMENTS
+from headway.lab.sweep import Comparison
 from headway.lab.tables import axis_label, new_table, value_label, varying
-from headway.sweeps.cost import Plan
-from headway.sweeps.experiments import EXPERIMENTS
-from headway.sweeps.jobs import Comparison
-from headway.sweeps.status import duration
 from headway.task import EnvSpec, env_names, env_spec
 from headway.training.methods import METHODS, PRESETS
 
@@ -114,44 +112,18 @@ def experiments() -> tuple[list[Facts], Table]:
     return entries, table
 
 
-def plan(comparison: Comparison, planned: Plan) -> tuple[Facts, Table]:
-    """Describe every run of a comparison, and what the missing ones take."""
-    labels: dict[Any, list[str]] = {}
-    for cell, job in comparison.cells.items():
-        labels.setdefault(job.path, []).append(cell.arm)
+def states(comparison: Comparison) -> tuple[list[Facts], Table]:
+    """Describe every run of a comparison and how far it is."""
     table = new_table(f"Runs of {comparison.experiment.name}", "run", "arms", "state")
-    for name in ("iterations", "TFLOP", "about"):
-        table.add_column(name, justify="right")
-    entries = []
-    for one in planned.jobs:
-        job, seconds = one.job, planned.seconds([one])
-        place = job.path.relative_to(comparison.out / "runs").as_posix()
-        state = "begun" if one.state == "waiting" and one.finished_iterations else one.state
-        entries.append(
-            {
-                "run_dir": str(job.path),
-                "arms": labels[job.path],
-                "state": state,
-                "finished_iterations": one.finished_iterations,
-                "iterations": job.num_iterations,
-                "flop": one.flop,
-                "seconds": seconds,
-            }
-        )
-        table.add_row(
-            place,
-            ", ".join(labels[job.path]),
-            state,
-            f"{one.finished_iterations}/{job.num_iterations}",
-            f"{one.flop / 1e12:,.3g}",
-            duration(seconds) if seconds else "–",
-        )
-    total = planned.seconds()
-    missing = sum(one.state == "waiting" for one in planned.jobs)
-    table.caption = (
-        f"{missing} of {len(planned.jobs)} runs are missing: about {duration(total)} one after"
-        f" another at {planned.flop_per_second / 1e9:,.3g} GFLOP/s ({planned.source};"
-        " compiling and simulating come on top)"
-    )
-    facts = {"runs": entries, "seconds": total, "speed_from": planned.source}
-    return facts, table
+    table.add_column("iterations", justify="right")
+    entries, cells = [], comparison.cells
+    for job in comparison.jobs:
+        state, total = job.state, job.config.collection.num_iterations
+        arms = [cell.arm for cell, other in cells.items() if other.path == job.path]
+        facts = {"run_dir": str(job.path), "arms": arms, "state": state.name, "note": state.note}
+        entries.append({**facts, "finished_iterations": state.iterations, "iterations": total})
+        note = f"{state.name} {state.note}".rstrip()
+        table.add_row(job.name, ", ".join(arms), note, f"{state.iterations}/{total}")
+    missing = sum(one["state"] in ("missing", "begun") for one in entries)
+    table.caption = f"{missing} of {len(entries)} runs are missing"
+    return entries, table

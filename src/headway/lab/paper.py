@@ -1,4 +1,4 @@
-"""The comparisons of the paper as one table: named experiments, each a list of arms.
+"""The paper's experiments as one table: named comparisons, each a list of arms.
 
 An arm is a method with some settings, trained and tested with them: where an arm changes the
 planner, it also collects its data with that planner, as the released code does. Values that the
@@ -18,9 +18,9 @@ from headway.training.methods import METHODS
 Settings = Mapping[str, Any]
 Measure = Literal["unseen", "collected"]
 
-NUM_HEADS = (1, 2, 3, 5, 8)
-SEGMENT_LENGTHS = (1, 5, 10, 20, 50)
-SELECTION_LENGTHS = (1, 5, 10, 20, 50)
+PAPER_ENVS = (
+    "cartpole-swingup", "pendulum", "hopper", "slim-humanoid", "half-cheetah", "crippled-ant",
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,13 +53,9 @@ class Experiment:
     @property
     def reference_arm(self) -> Arm:
         """The arm that the others are compared with."""
-        found = [arm for arm in self.arms if arm.label == self.reference]
-        return found[0] if found else self.arms[0]
+        return next((arm for arm in self.arms if arm.label == self.reference), self.arms[0])
 
 
-_CONTEXT_OFF: Settings = {"model.context_size": 0, "model.backward_net": False}
-_TMCL = Arm("T-MCL")
-_MCL = Arm("MCL", "mcl")
 _LABELS = {  # a method that is not named here stands under its own name
     "tmcl": "T-MCL",
     "mcl": "MCL",
@@ -78,31 +74,20 @@ _LABELS = {  # a method that is not named here stands under its own name
 }
 
 
-def _selection(label: str, head_selection: str) -> Arm:
-    return Arm(label, settings={"planner.head_selection": head_selection})
+_METHODS = tuple(Arm(_LABELS.get(name, name), name) for name in METHODS)
 
 
-def _segments(length: int) -> Arm:
-    # Heads that compete for segments of one transition are MCL, so these share their runs.
-    if length == 1:
-        return dataclasses.replace(_MCL, label="M = 1")
-    return Arm(f"M = {length}", settings={"fitting.segment_length": length})
+def _selection(head_selection: str, label: str = "") -> Arm:
+    return Arm(label or head_selection, settings={"planner.head_selection": head_selection})
 
 
-def _past(length: int) -> Arm:
-    chosen: dict[str, Any] = {"planner.selection_length": length}
-    if length == 1:  # the preset `released-code` would skip this only transition
-        chosen["planner.selection_skips_newest"] = False
-    return Arm(f"N = {length}", settings=chosen)
-
-
-def _all_methods() -> tuple[Arm, ...]:
-    return tuple(Arm(_LABELS.get(name, name), name) for name in METHODS)
+def _values(letter: str, setting: str, *values: int) -> tuple[Arm, ...]:
+    return tuple(Arm(f"{letter} = {value}", settings={setting: value}) for value in values)
 
 
 _EXPERIMENTS = (
-    Experiment("comparison", "every method on unseen physics", _all_methods()),
-    Experiment("fig9", "every method while learning", _all_methods(), measure="collected"),
+    Experiment("comparison", "every method on unseen physics", _METHODS),
+    Experiment("fig9", "every method while learning", _METHODS, measure="collected"),
     Experiment(
         "fig10",
         "PETS with one head and with several",
@@ -112,30 +97,41 @@ _EXPERIMENTS = (
     Experiment(
         "fig11",
         "adaptive and non-adaptive planning",
-        (_selection("adaptive", "adaptive"), _selection("non-adaptive (average)", "average")),
+        (_selection("adaptive"), _selection("average", "non-adaptive (average)")),
     ),
     Experiment(
         "fig12",
         "with and without context learning",
-        (Arm("with context"), Arm("without context", settings=_CONTEXT_OFF)),
+        (
+            Arm("with context"),
+            Arm("without context", settings={"model.context_size": 0, "model.backward_net": False}),
+        ),
     ),
-    Experiment("fig13", "MCL and T-MCL", (_MCL, _TMCL), "T-MCL"),
+    Experiment("fig13", "MCL and T-MCL", (Arm("MCL", "mcl"), Arm("T-MCL")), "T-MCL"),
     Experiment(
         "fig14",
         "number of prediction heads H",
-        tuple(Arm(f"H = {heads}", settings={"model.num_heads": heads}) for heads in NUM_HEADS),
+        _values("H", "model.num_heads", 1, 2, 3, 5, 8),
         "H = 3",
     ),
     Experiment(
         "fig15",
         "segment length M of the oracle loss",
-        tuple(_segments(length) for length in SEGMENT_LENGTHS),
+        # Heads that compete for segments of one transition are MCL, so these share their runs.
+        (Arm("M = 1", "mcl"), *_values("M", "fitting.segment_length", 5, 10, 20, 50)),
         "M = 10",
     ),
     Experiment(
         "fig16",
         "past transitions N that select a head",
-        tuple(_past(length) for length in SELECTION_LENGTHS),
+        (
+            # The preset `released-code` would skip the only transition.
+            Arm(
+                "N = 1",
+                settings={"planner.selection_length": 1, "planner.selection_skips_newest": False},
+            ),
+            *_values("N", "planner.selection_length", 5, 10, 20, 50),
+        ),
         "N = 10",
     ),
     Experiment(
@@ -144,20 +140,14 @@ _EXPERIMENTS = (
         (Arm("three heads"), Arm("one head", settings={"model.num_heads": 1})),
     ),
     Experiment(
-        "selection",
-        "which head plans",
-        (
-            _selection("adaptive", "adaptive"),
-            _selection("average", "average"),
-            _selection("random", "random"),
-        ),
+        "selection", "which head plans", tuple(map(_selection, ("adaptive", "average", "random")))
     ),
     Experiment(
         "oracle",
         "what a head wins: trajectory segments, transitions, nothing",
         (
             Arm("trajectory-wise"),
-            dataclasses.replace(_MCL, label="transition-wise"),
+            Arm("transition-wise", "mcl"),
             Arm("independent", settings={"fitting.oracle": "independent"}),
         ),
     ),
