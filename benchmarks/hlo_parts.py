@@ -33,7 +33,7 @@ RULES = (
     ("models/networks.py", "Dense.__call__", ACTIVATION),
     ("models/networks.py", "bound_logvar", SAMPLING),
     ("planning/imagination.py", "Layer.__call__", ACTIVATION),
-    ("models/products.py", "", ACTIVATION),
+    ("models.networks.py", "", ACTIVATION),
     ("planning/imagination.py", "rough_swish", ACTIVATION),
     ("planning/imagination.py", "fold", BEFORE),
     ("planning/imagination.py", "", SAMPLING),

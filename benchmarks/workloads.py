@@ -82,7 +82,7 @@ def make_fit(
         num_members=model.num_members,
         key=jax.random.key(1),
     )
-    return setup.init(dynamics), setup, data
+    return FitState.new(dynamics), setup, data
 
 
 def update_flop(model: MultiHeadDynamics, batch_size: int) -> float:

@@ -8,8 +8,8 @@ import numpy as np
 
 from headway.config import MultiHeadedConfig
 from headway.data import Episodes, Samples, Trajectory
-from headway.models.multi_headed import GaussianNet, MultiHeadDynamics, Statistics
-from headway.models.networks import Dense, DenseHeads
+from headway.models.multi_headed import MultiHeadDynamics, Statistics
+from headway.models.networks import Dense, DenseHeads, GaussianNet
 from headway.planning.agent import Agent
 from headway.planning.heads import MultiHeadModel
 from headway.planning.optimizers import where_env

@@ -101,6 +101,7 @@ class ModelConfig:
     context_size: int = 0
     context_hidden_sizes: tuple[int, ...] = ()
     backward_net: bool = False
+    backward_deterministic: bool = False
     deterministic: bool = True
     relation_head: bool = False
 

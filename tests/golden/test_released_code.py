@@ -16,16 +16,19 @@ import pytest
 from headway.config import FittingConfig
 from headway.data import History, segment_sums
 from headway.envs.locomotion import HalfCheetahTask
-from headway.models.fitting import Assignment, Batch, head_losses, total_loss
 from headway.models.losses import (
+    Assignment,
+    Batch,
     assign_heads,
+    head_losses,
     independent_loss,
     logvar_bound_loss,
     oracle_loss,
+    total_loss,
     weight_decay_loss,
 )
-from headway.models.multi_headed import ContextEncoder, GaussianNet, MultiHeadDynamics, Statistics
-from headway.models.networks import Dense, DenseHeads, Normalizer
+from headway.models.multi_headed import MultiHeadDynamics, Statistics
+from headway.models.networks import ContextEncoder, Dense, DenseHeads, GaussianNet, Normalizer
 
 SEGMENT = 10
 NUM_HEADS = 3

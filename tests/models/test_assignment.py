@@ -9,14 +9,8 @@ import pytest
 
 import toys
 from headway.config import FittingConfig
-from headway.models.fitting import (
-    Assignment,
-    FitSetup,
-    assign_segments,
-    gather_batch,
-    make_data,
-    shuffle,
-)
+from headway.models.fitting import FitSetup, assign_segments, gather_batch, make_data
+from headway.models.losses import Assignment
 
 UP, DOWN = np.eye(2), -np.eye(2)
 STATISTICS = toys.identity_statistics()
@@ -157,19 +151,6 @@ def test_a_sample_has_its_own_transition_but_its_anchors_history_and_head():
             np.testing.assert_array_equal(batch.history.obs_diff[member, i], past.obs_diff)
             assert owners.forward[member, i] == heads[member, episode, anchor // 2]
             assert owners.backward[member, i] == 100 - heads[member, episode, anchor // 2]
-
-
-@pytest.mark.parametrize("batch_size", [1, 4, 1000])
-def test_every_epoch_visits_every_sample_once_per_member_in_its_own_order(batch_size):
-    data = data_of([toys.random_trajectory(12)], sample_capacity=40)
-    count = int(data.samples.count)
-    order = np.asarray(shuffle(data, batch_size, jax.random.key(0)))
-    assert order.shape[1] % batch_size == 0
-    assert order.shape[1] >= count
-    np.testing.assert_array_equal(np.sort(order[:, :count]), np.tile(np.arange(count), (2, 1)))
-    assert (order[0, :count] != order[1, :count]).any()
-    other = np.asarray(shuffle(data, batch_size, jax.random.key(1)))
-    assert (order[0, :count] != other[0, :count]).any()
 
 
 def test_bootstrap_draws_valid_samples_with_replacement_anew_for_each_member():

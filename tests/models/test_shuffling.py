@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from headway.models.shuffling import permutations
+from headway.models.fitting import permutations
 
 drawn = jax.jit(permutations, static_argnums=1)
 

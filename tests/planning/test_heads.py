@@ -12,9 +12,15 @@ import toys
 from headway.config import CEMConfig, PlannerConfig
 from headway.errors import ConfigError
 from headway.models.base import RecentTransitions, Transition
-from headway.models.multi_headed import GaussianNet, MultiHeadDynamics, network_input
-from headway.models.networks import DenseHeads, Normalizer, bound_logvar, swish
-from headway.models.products import rounded
+from headway.models.multi_headed import MultiHeadDynamics, network_input
+from headway.models.networks import (
+    DenseHeads,
+    GaussianNet,
+    Normalizer,
+    bound_logvar,
+    rounded,
+    swish,
+)
 from headway.planning.controller import Controller
 from headway.planning.flop import plan_flop
 from headway.planning.heads import (

@@ -9,8 +9,8 @@ import pytest
 
 import toys
 from headway.config import PlannerConfig
-from headway.models.multi_headed import GaussianNet, MultiHeadDynamics
-from headway.models.networks import DenseHeads
+from headway.models.multi_headed import MultiHeadDynamics
+from headway.models.networks import DenseHeads, GaussianNet
 from headway.planning import cpu
 from headway.planning.heads import MultiHeadModel, fold
 from headway.planning.rollouts import candidate_returns

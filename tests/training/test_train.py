@@ -11,7 +11,7 @@ import runs
 from headway.data import Trajectory
 from headway.errors import ConfigError, DivergenceError, PlanningError, UnknownNameError
 from headway.experiment.learners import Learned
-from headway.models.updates import EpochStats
+from headway.models.fitting import EpochStats
 from headway.task import env_names
 from headway.training import loading, train
 from headway.training.collect import Environments

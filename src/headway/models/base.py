@@ -23,8 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from headway.config import Precision
 from headway.data import History
-from headway.models.networks import Dense
-from headway.models.products import PRECISIONS, rounded
+from headway.models.networks import PRECISIONS, Dense, rounded
 from headway.task import Task
 
 Keys = Key[Array, "2"]

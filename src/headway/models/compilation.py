@@ -54,7 +54,7 @@ def prepare_jax() -> None:
         folder = platformdirs.user_cache_path("headway", appauthor=False) / "compiled"
         jax.config.update("jax_compilation_cache_dir", str(folder))
     name = "jax_persistent_cache_min_compile_time_secs"
-    folder, kept_from = settings.jax_compilation_cache_dir, getattr(settings, name)
+    folder, kept_from = str(settings.jax_compilation_cache_dir), getattr(settings, name)
     if not _can_write(folder):
         if kept_from != float("inf"):
             warnings.warn(

@@ -13,8 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from headway.config import FittingConfig, ModelConfig, Precision
-from headway.data import Episodes
+from headway.config import ModelConfig, Precision
 from headway.models.base import (
     Dynamics,
     Keys,
@@ -26,10 +25,9 @@ from headway.models.base import (
     plan_layers,
 )
 from headway.models.compilation import jit_networks
-from headway.models.fitting import FitData
+from headway.models.fitting import EpochStats, FitData, FitSetup, FitState, run_updates
 from headway.models.multi_headed import Statistics, network_input
 from headway.models.networks import Dense
-from headway.models.updates import EpochStats, Fitted, Tally
 from headway.task import Task
 
 
@@ -117,47 +115,59 @@ def meta_loss(net: ReluNet, past: Window, future: Window, rate: float) -> Float[
     return jax.vmap(of_task)(past, future).mean()
 
 
-class MetaSetup(eqx.Module):
-    """What fixes the compiled epoch."""
+@jit_networks
+def meta_epoch(
+    state: FitState,
+    setup: FitSetup,
+    data: FitData,
+    *,
+    length: int,
+    rate: float,
+    key: PRNGKeyArray,
+) -> tuple[FitState, EpochStats]:
+    """Take as many meta-updates as it takes to see as many transitions as there are.
 
-    task: Task
-    fitting: FittingConfig = eqx.field(static=True)
-    length: int = eqx.field(static=True)
-    """Past transitions that the inner step sees, and future ones that it is judged by."""
-    rate: float = eqx.field(static=True)
-    """Step size of the inner step."""
+    A task is an episode and a step of it; the transitions of an update's tasks fill a batch. Long
+    episodes are drawn more often, so that all transitions count the same. A whole past fits before
+    the step wherever the episode is long enough.
 
-    @property
-    def num_tasks(self) -> int:
-        """Tasks per update: their transitions fill a batch."""
-        return max(1, self.fitting.batch_size // (2 * self.length))
-
-
-def draw_moments(
-    data: FitData, setup: MetaSetup, key: PRNGKeyArray
-) -> tuple[Int[Array, " task"], Int[Array, " task"]]:
-    """Draw an episode and a step of it for each task.
-
-    Long episodes are drawn more often, so that all transitions count the same. A whole past
-    fits before the step wherever the episode is long enough.
+    Args:
+        state: Network and optimiser.
+        setup: Task and settings.
+        data: The data set, with its normalisers.
+        length: Past transitions that the inner step sees, and future ones that judge it.
+        rate: Step size of the inner step.
+        key: Draws the tasks.
     """
-    row_key, step_key = jax.random.split(key)
-    rows = jax.random.randint(row_key, (setup.num_tasks,), 0, data.samples.count)
-    episode = data.samples.episode[rows]
-    length = data.episodes.length[episode]
-    first = jnp.minimum(setup.length, length - 1)
-    return episode, jax.random.randint(step_key, episode.shape, first, length)
+    config, samples, lengths = setup.config, data.samples, data.episodes.length
+    num_tasks = max(1, config.batch_size // (2 * length))
+    num_updates = jnp.maximum(samples.count // (2 * length * num_tasks), 1)
+
+    def update(i, state):
+        row_key, step_key = jax.random.split(jax.random.fold_in(key, i))
+        rows = jax.random.randint(row_key, (num_tasks,), 0, samples.count)
+        episode = samples.episode[rows]
+        first = jnp.minimum(length, lengths[episode] - 1)
+        step = jax.random.randint(step_key, (num_tasks,), first, lengths[episode])
+        past = window(setup.task, data, episode, step - length, length)
+        future = window(setup.task, data, episode, step, length)
+        loss, grads = jax.value_and_grad(meta_loss)(state.model, past, future, rate)
+        state, skipped = state.step(loss, grads, config.learning_rate)
+        return state, loss, loss, skipped
+
+    return run_updates(state, num_updates, update)
 
 
 def window(
-    setup: MetaSetup,
+    task: Task,
     data: FitData,
     episode: Int[Array, " task"],
     start: Int[Array, " task"],
+    length: int,
 ) -> Window:
     """The `length` transitions of each task that begin with a step; those outside weigh 0."""
-    episodes: Episodes = data.episodes
-    step = start[:, None] + jnp.arange(setup.length)
+    episodes = data.episodes
+    step = start[:, None] + jnp.arange(length)
     inside = (step >= 0) & (step < episodes.length[episode][:, None])
     step = jnp.clip(step, 0, episodes.action.shape[1] - 1)
     rows = episode[:, None]
@@ -166,36 +176,7 @@ def window(
         episodes.action[rows, step],
         episodes.obs[rows, step + 1],
     )
-    return Window.of(setup.task, data.statistics, transitions, inside.astype(jnp.float32))
-
-
-@jit_networks
-def meta_epoch(
-    state: Fitted, setup: MetaSetup, data: FitData, *, key: PRNGKeyArray
-) -> tuple[Fitted, EpochStats]:
-    """Take as many meta-updates as it takes to see as many transitions as there are.
-
-    Args:
-        state: Network and optimiser.
-        setup: Task and settings.
-        data: The data set, with its normalisers.
-        key: Draws the tasks.
-    """
-    per_update = setup.num_tasks * 2 * setup.length
-    num_updates = jnp.maximum(data.samples.count // per_update, 1)
-    rate = setup.fitting.learning_rate
-
-    def update(i, carry):
-        state, tally = carry
-        episode, moment = draw_moments(data, setup, jax.random.fold_in(key, i))
-        past = window(setup, data, episode, moment - setup.length)
-        future = window(setup, data, episode, moment)
-        loss, grads = jax.value_and_grad(meta_loss)(state.model, past, future, setup.rate)
-        state, skipped = state.step(loss, grads, rate)
-        return state, tally.add(loss, skipped)
-
-    state, tally = jax.lax.fori_loop(0, num_updates, update, (state, Tally.zero()))
-    return state, tally.stats
+    return Window.of(task, data.statistics, transitions, inside.astype(jnp.float32))
 
 
 def glorot(key: PRNGKeyArray, shape: tuple[int, ...]) -> Array:

@@ -3,16 +3,49 @@
 Everything is per member: heads compete within a member, never across members.
 """
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from headway.models.multi_headed import ContextEncoder, GaussianNet, MultiHeadDynamics, Prediction
+from headway.config import FittingConfig
+from headway.data import History
+from headway.models.multi_headed import MultiHeadDynamics, Statistics, network_input
+from headway.models.networks import ContextEncoder, GaussianNet, Prediction
+from headway.task import Task
 
 HIDDEN_DECAY = (2.5e-5, 5e-5, 7.5e-5)
 HEAD_DECAY = 1e-4
+
+
+class Batch(NamedTuple):
+    """Samples of every member; leading axes [member, sample]."""
+
+    obs: Float[Array, "member sample obs"]
+    action: Float[Array, "member sample action"]
+    next_obs: Float[Array, "member sample obs"]
+    history: History
+    weight: Float[Array, "member sample"]
+    """1 for a sample, 0 for padding."""
+    sim_params: Float[Array, "member sample sim_param"] | None = None
+    """The true simulator parameters, for a model that is told them."""
+    trajectory: Int[Array, "member sample"] | None = None
+    """Row of the trajectory that each sample comes from."""
+
+
+class HeadLosses(NamedTuple):
+    """NLL of every head on every sample, forwards and backwards in time."""
+
+    forward: Float[Array, "member head sample"]
+    backward: Float[Array, "member head sample"] | None
+
+
+class Assignment(NamedTuple):
+    """The best head per member and segment (or sample), for each direction."""
+
+    forward: Int[Array, "member *segment"]
+    backward: Int[Array, "member *segment"] | None
 
 
 def negative_log_likelihood(
@@ -23,7 +56,7 @@ def negative_log_likelihood(
     `(mean - target)^2 exp(-logvar) + logvar` (released code).
 
     Args:
-        prediction: What is compared with the target.
+        prediction: Compared with the target.
         target: The normalised `delta`, broadcast against it.
         axis: That of the dimensions, over which the average is.
     """
@@ -31,6 +64,25 @@ def negative_log_likelihood(
     if prediction.logvar is None:
         return squared.mean(axis)
     return (squared * jnp.exp(-prediction.logvar) + prediction.logvar).mean(axis)
+
+
+def head_losses(
+    model: MultiHeadDynamics, task: Task, statistics: Statistics, batch: Batch
+) -> HeadLosses:
+    """Loss of every head on every sample, with the context of the sample's history."""
+    context = model.context(batch.history, statistics, batch.sim_params)
+
+    def losses(net: GaussianNet, start, end, delta) -> Float[Array, "member head sample"]:
+        x = network_input(task, statistics, start, batch.action)
+        target = delta.normalize(task.target(start, end)).mT
+        prediction = net.columns(x.mT, None if context is None else context.mT)
+        return negative_log_likelihood(prediction, target[:, None], axis=-2)
+
+    forward = losses(model.forward_net, batch.obs, batch.next_obs, statistics.delta)
+    if model.backward_net is None:
+        return HeadLosses(forward, None)
+    backward = losses(model.backward_net, batch.next_obs, batch.obs, statistics.backward_delta)
+    return HeadLosses(forward, backward)
 
 
 def assign_heads(losses: Float[Array, "*batch head segment"]) -> Int[Array, "*batch segment"]:
@@ -44,12 +96,7 @@ def assign_heads(losses: Float[Array, "*batch head segment"]) -> Int[Array, "*ba
 def independent_loss(
     losses: Float[Array, "member head sample"], weight: Float[Array, "member sample"]
 ) -> Float[Array, ""]:
-    """Every head learns from every sample: mean over samples and heads, sum over members.
-
-    Args:
-        losses: NLL of every head on every sample.
-        weight: 1 for a sample, 0 for padding.
-    """
+    """Every head learns from every sample: mean over samples and heads, sum over members."""
     per_head = (losses * weight[:, None]).sum(-1) / jnp.maximum(weight.sum(-1), 1.0)[:, None]
     return per_head.mean(-1).sum()
 
@@ -60,14 +107,14 @@ def oracle_loss(
     weight: Float[Array, "member sample"],
     reduction: Literal["head", "segment"] = "head",
 ) -> Float[Array, ""]:
-    """Each sample teaches only the head that owns it; sum over members.
+    """Each sample teaches only its best head; sum over members.
 
     Args:
         losses: NLL of every head on every sample.
-        assignment: The head that owns each sample.
+        assignment: The best head of each sample.
         weight: 1 for a sample, 0 for padding.
         reduction: `head` averages within each head, then sums over heads, so that a head
-            counts the same however few samples it owns (released code); `segment`
+            counts the same however few samples it has (released code); `segment`
             is the plain average over samples.
     """
     num_heads = losses.shape[1]
@@ -76,6 +123,39 @@ def oracle_loss(
     if reduction == "head":
         return (total / jnp.maximum(owned.sum(-1), 1.0)).sum()
     return (total.sum(-1) / jnp.maximum(weight.sum(-1), 1.0)).sum()
+
+
+def total_loss(
+    model: MultiHeadDynamics,
+    losses: HeadLosses,
+    assignment: Assignment | None,
+    weight: Float[Array, "member sample"],
+    config: FittingConfig,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The objective (paper, section 3), and the forward prediction loss in it.
+
+    Args:
+        model: For its variance bounds and weights.
+        losses: Loss of every head on every sample.
+        assignment: The best head of each sample; None trains all heads on all samples.
+        weight: 1 for a sample, 0 for padding.
+        config: Weights of the terms.
+    """
+
+    def reduce(direction, heads):
+        if heads is None:
+            return independent_loss(direction, weight)
+        return oracle_loss(direction, heads, weight, config.reduction)
+
+    bound = config.logvar_bound_weight
+    forward = reduce(losses.forward, assignment and assignment.forward)
+    loss = forward + bound * logvar_bound_loss(model.forward_net)
+    if losses.backward is not None and model.backward_net is not None:
+        backward = reduce(losses.backward, assignment and assignment.backward)
+        backward = backward + bound * logvar_bound_loss(model.backward_net)
+        loss = loss + config.backward_weight * backward
+    decay = model_decay_loss(model, context=config.context_weight_decay)
+    return loss + config.weight_decay * decay, forward
 
 
 def logvar_bound_loss(net: GaussianNet) -> Float[Array, ""]:
@@ -87,24 +167,22 @@ def logvar_bound_loss(net: GaussianNet) -> Float[Array, ""]:
 
 def weight_decay_loss(net: GaussianNet | ContextEncoder) -> Float[Array, ""]:
     """Per-layer L2 penalty c/2 |W|^2 over all members; biases are free (released code)."""
-    layers = [*net.hidden]
+    layers, heads = [*net.hidden], []
     if isinstance(net, ContextEncoder):
-        heads = []
         layers.append(net.output)
     else:
         heads = [head for head in (net.mean_heads, net.logvar_heads) if head is not None]
     decays = [HIDDEN_DECAY[min(i, len(HIDDEN_DECAY) - 1)] for i in range(len(layers))]
     weighted = [*zip(decays, layers, strict=True), *((HEAD_DECAY, head) for head in heads)]
-    penalties = [c * sum_of_squares(layer.weight) for c, layer in weighted]
-    return 0.5 * jnp.stack(penalties).sum()
-
-
-def sum_of_squares(values: Float[Array | np.ndarray, "..."]) -> Float[Array, ""]:
-    """As a product, which XLA computes faster than a sum on one core of a CPU."""
-    return jnp.vdot(values, values, precision="highest")
+    return 0.5 * jnp.stack([c * sum_of_squares(layer.weight) for c, layer in weighted]).sum()
 
 
 def model_decay_loss(model: MultiHeadDynamics, *, context: bool) -> Float[Array, ""]:
     """Weight decay of every network; the context encoder's only if `context`."""
     nets = [model.forward_net, model.backward_net, model.context_encoder if context else None]
     return sum((weight_decay_loss(net) for net in nets if net is not None), jnp.zeros(()))
+
+
+def sum_of_squares(values: Float[Array | np.ndarray, "..."]) -> Float[Array, ""]:
+    """As a product, which XLA computes faster than a sum on one core of a CPU."""
+    return jnp.vdot(values, values, precision="highest")

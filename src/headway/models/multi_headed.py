@@ -1,7 +1,6 @@
 """The multi-headed, context-conditional dynamics model (supplement A.3)."""
 
-import functools
-from typing import NamedTuple
+import dataclasses
 
 import equinox as eqx
 import jax
@@ -16,128 +15,8 @@ from headway.data import (
     history_action_moments,
     sim_params_row,
 )
-from headway.models.networks import (
-    Dense,
-    DenseHeads,
-    Normalizer,
-    bound_logvar,
-    columns_of_each,
-    in_precision,
-    swish,
-)
-from headway.models.products import row_by_row
+from headway.models.networks import ContextEncoder, Dense, DenseHeads, GaussianNet, Normalizer
 from headway.task import Task
-
-
-class Prediction(NamedTuple):
-    """Gaussian over the normalised `delta`; `logvar` is None in deterministic mode."""
-
-    mean: Float[Array, "*batch obs"]
-    logvar: Float[Array, "*batch obs"] | None
-
-    @property
-    def mT(self) -> "Prediction":  # noqa: N802, as arrays call it
-        """The same with the last two axes exchanged."""
-        return Prediction(self.mean.mT, None if self.logvar is None else self.logvar.mT)
-
-
-class NetSizes(NamedTuple):
-    """Widths of what enters and leaves a network."""
-
-    input: int
-    context: int
-    output: int
-
-
-class GaussianNet(eqx.Module):
-    """Backbone and prediction heads of every member; the context joins on the way."""
-
-    hidden: tuple[Dense, ...]
-    mean_heads: DenseHeads
-    logvar_heads: DenseHeads | None
-    max_logvar: Float[Array, "head obs"] | None
-    min_logvar: Float[Array, "head obs"] | None
-    context_layer: int | None = eqx.field(static=True, default=None)
-    """The hidden layer that takes the context beside its input; None if the heads do."""
-
-    @classmethod
-    def init(
-        cls,
-        config: ModelConfig,
-        sizes: NetSizes,
-        *,
-        deterministic: bool,
-        key: PRNGKeyArray,
-    ) -> "GaussianNet":
-        """Draw the weights of one network per member."""
-        members, heads = config.num_members, config.num_heads
-        place = context_layer(config)
-        *hidden_keys, mean_key, logvar_key = jax.random.split(key, len(config.hidden_sizes) + 2)
-        widths = [sizes.input, *config.hidden_sizes]
-        outs = widths[1:]
-        widths[-1 if place is None else place] += sizes.context
-        *ins, head_size = widths
-        hidden = tuple(
-            Dense.init(members, n, m, key=k) for n, m, k in zip(ins, outs, hidden_keys, strict=True)
-        )
-        mean_heads = DenseHeads.init(members, heads, head_size, sizes.output, key=mean_key)
-        if deterministic:
-            return cls(hidden, mean_heads, None, None, None, place)
-        logvar_heads = DenseHeads.init(members, heads, head_size, sizes.output, key=logvar_key)
-        shape = (heads, sizes.output)
-        bounds = jnp.full(shape, 0.5, jnp.float32), jnp.full(shape, -10.0, jnp.float32)
-        return cls(hidden, mean_heads, logvar_heads, *bounds, place)
-
-    def __call__(
-        self,
-        x: Float[Array, "member batch in"],
-        context: Float[Array, "member batch context"] | None,
-    ) -> Prediction:
-        """Predict with every head; results are [member, head, batch, obs]."""
-        return self.columns(x.mT, None if context is None else context.mT).mT
-
-    def columns(
-        self,
-        x: Float[Array, "member in batch"],
-        context: Float[Array, "member context batch"] | None,
-    ) -> Prediction:
-        """The same with features before samples; results are [member, head, obs, batch]."""
-        return self._predict(self._head_input(x, context))
-
-    def head_input(
-        self,
-        x: Float[Array, "member batch in"],
-        context: Float[Array, "member batch context"] | None,
-    ) -> Float[Array, "member batch hidden"]:
-        """Run the shared hidden layers; where the context joins the heads, it is appended."""
-        return self._head_input(x.mT, None if context is None else context.mT).mT
-
-    def _head_input(
-        self,
-        x: Float[Array, "member in batch"],
-        context: Float[Array, "member context batch"] | None,
-    ) -> Float[Array, "member hidden batch"]:
-        x = row_by_row(x)
-        for index, layer in enumerate(self.hidden):
-            x = swish(layer.columns(_joined(x, context) if index == self.context_layer else x))
-        return _joined(x, context) if self.context_layer is None else x
-
-    def predict(self, x: Float[Array, "member batch hidden"]) -> Prediction:
-        """Run the heads; results are [member, head, batch, obs]."""
-        return self._predict(x.mT).mT
-
-    def _predict(self, x: Float[Array, "member hidden batch"]) -> Prediction:
-        if self.logvar_heads is None:
-            return Prediction(self.mean_heads.columns(x), None)
-        mean, logvar = columns_of_each((self.mean_heads, self.logvar_heads), x)
-        low, high = self.min_logvar[:, :, None], self.max_logvar[:, :, None]
-        return Prediction(mean, bound_logvar(logvar, low, high))
-
-
-def context_layer(config: ModelConfig) -> int | None:
-    """Which hidden layer takes the context beside its input; None if the heads do."""
-    last = len(config.hidden_sizes) - 1
-    return {"input": 0, "last-hidden": last, "head": None}[config.context_at]
 
 
 def context_size(config: ModelConfig, task: Task, num_sim_params: int) -> int:
@@ -151,37 +30,6 @@ def context_size(config: ModelConfig, task: Task, num_sim_params: int) -> int:
     history = config.history_length * (task.obs_size + task.action_size)
     of_kind = {"learned": config.context_size, "history": history, "sim-params": num_sim_params}
     return of_kind[config.context]
-
-
-def _joined(
-    x: Float[Array, "member in batch"], context: Float[Array, "member context batch"] | None
-) -> Float[Array, "member wider batch"]:
-    return x if context is None else jnp.concatenate([x, context], axis=1)
-
-
-class ContextEncoder(eqx.Module):
-    """Turns the last K transitions into a context vector, once per member."""
-
-    hidden: tuple[Dense, ...]
-    output: Dense
-
-    @classmethod
-    def init(cls, config: ModelConfig, in_size: int, *, key: PRNGKeyArray) -> "ContextEncoder":
-        """Draw the weights of one encoder per member."""
-        sizes = (in_size, *config.context_hidden_sizes, config.context_size)
-        keys = jax.random.split(key, len(sizes) - 1)
-        *hidden, output = (
-            Dense.init(config.num_members, n, m, key=k)
-            for n, m, k in zip(sizes[:-1], sizes[1:], keys, strict=True)
-        )
-        return cls(tuple(hidden), output)
-
-    def __call__(self, x: Float[Array, "member batch in"]) -> Float[Array, "member batch context"]:
-        """Encode flattened histories."""
-        x = row_by_row(x.mT)
-        for layer in self.hidden:
-            x = jax.nn.relu(layer.columns(x))
-        return self.output.columns(x).mT
 
 
 class Statistics(eqx.Module):
@@ -279,14 +127,15 @@ class MultiHeadDynamics(eqx.Module):
         """
         forward_key, backward_key, context_key = jax.random.split(key, 3)
         width = context_size(config, task, len(sim_param_names))
-        sizes = NetSizes(task.feature_size + task.action_size, width, task.obs_size)
         deterministic = config.deterministic
-        forward = GaussianNet.init(config, sizes, deterministic=deterministic, key=forward_key)
+        forward = GaussianNet.init(
+            config, task, width, deterministic=deterministic, key=forward_key
+        )
         backward = encoder = relation = None
         if config.backward_net:
             deterministic = config.deterministic or config.backward_deterministic
             backward = GaussianNet.init(
-                config, sizes, deterministic=deterministic, key=backward_key
+                config, task, width, deterministic=deterministic, key=backward_key
             )
         if config.context == "learned" and width:
             history_size = config.history_length * (task.obs_size + task.action_size)
@@ -304,15 +153,19 @@ class MultiHeadDynamics(eqx.Module):
         """
         if precision == "float32":
             return self
-        change = functools.partial(in_precision, precision=precision)
-        return eqx.tree_at(MultiHeadDynamics._inner_layers, self, replace_fn=change)
 
-    def _inner_layers(self) -> list[Dense | DenseHeads]:
-        nets = [net for net in (self.forward_net, self.backward_net) if net is not None]
-        layers = [layer for net in nets for layer in (*net.hidden[1:], net.mean_heads)]
-        layers += [net.logvar_heads for net in nets if net.logvar_heads is not None]
-        encoder = self.context_encoder
-        return layers if encoder is None else [*layers, *encoder.hidden, encoder.output]
+        def inner_layers(model: MultiHeadDynamics) -> list[Dense | DenseHeads]:
+            nets = [net for net in (model.forward_net, model.backward_net) if net is not None]
+            layers = [layer for net in nets for layer in (*net.hidden[1:], net.mean_heads)]
+            layers += [net.logvar_heads for net in nets if net.logvar_heads is not None]
+            encoder = model.context_encoder
+            return layers if encoder is None else [*layers, *encoder.hidden, encoder.output]
+
+        return eqx.tree_at(
+            inner_layers,
+            self,
+            replace_fn=lambda layer: dataclasses.replace(layer, precision=precision),
+        )
 
     @property
     def num_members(self) -> int:

@@ -9,16 +9,15 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from headway.config import FittingConfig, ModelConfig, Precision
+from headway.config import ModelConfig, Precision
 from headway.models.base import Dynamics, Keys, Layer, Model, Transition, plan_layers
 from headway.models.compilation import jit_networks
-from headway.models.fitting import FitData
+from headway.models.fitting import EpochStats, FitData, FitSetup, FitState, run_updates
 from headway.models.grbal import Window, glorot, next_obs, wide_input
 from headway.models.multi_headed import Statistics, network_input
 from headway.models.networks import Dense
-from headway.models.updates import EpochStats, Fitted, Tally
 from headway.task import Task
 
 FORGET_BIAS = 1.0
@@ -88,17 +87,6 @@ def next_cell(before: CellState, gates: Float[Array, "*gates"], axis: int) -> Ce
     return CellState(jax.nn.sigmoid(let_out) * jnp.tanh(cell), cell)
 
 
-class RecurrentSetup(eqx.Module):
-    """What fixes the compiled epoch."""
-
-    task: Task
-    fitting: FittingConfig = eqx.field(static=True)
-
-    def num_episodes(self, episode_length: int) -> int:
-        """Whole episodes of one update: as many as a batch holds, at least one."""
-        return max(1, self.fitting.batch_size // episode_length)
-
-
 def batch_gradient(
     net: RecurrentNet, batch: Window, steps: int
 ) -> tuple[Float[Array, ""], RecurrentNet]:
@@ -143,9 +131,9 @@ def batch_gradient(
 
 @jit_networks
 def recurrent_epoch(
-    state: Fitted, setup: RecurrentSetup, data: FitData, *, key: PRNGKeyArray
-) -> tuple[Fitted, EpochStats]:
-    """Go once through all episodes, in batches of whole ones.
+    state: FitState, setup: FitSetup, data: FitData, *, key: PRNGKeyArray
+) -> tuple[FitState, EpochStats]:
+    """Go once through all episodes, in batches of whole ones, at least one of them.
 
     Args:
         state: Network and optimiser.
@@ -153,39 +141,34 @@ def recurrent_epoch(
         data: The data set, with its normalisers.
         key: Shuffles the episodes.
     """
-    episodes = data.episodes
+    episodes, config = data.episodes, setup.config
     capacity, length = episodes.action.shape[:2]
-    size = setup.num_episodes(length)
+    size = max(1, config.batch_size // length)
     draws = jax.random.uniform(key, (capacity,))
     order = jnp.argsort(jnp.where(jnp.arange(capacity) < episodes.count, draws, jnp.inf))
     order = jnp.pad(order, (0, -capacity % size))
-    steps = min(setup.fitting.backprop_steps, length)
+    steps = min(config.backprop_steps, length)
 
-    def update(i, carry):
-        state, tally = carry
+    def update(i, state):
         chosen = jax.lax.dynamic_slice_in_dim(order, i * size, size)
-        batch = whole_episodes(setup, data, chosen, i * size + jnp.arange(size) < episodes.count)
+        counted = i * size + jnp.arange(size) < episodes.count
+        batch = whole_episodes(setup.task, data, chosen, counted)
         loss, grads = batch_gradient(state.model, batch, steps)
-        state, skipped = state.step(loss, grads, setup.fitting.learning_rate)
-        return state, tally.add(loss, skipped)
+        state, skipped = state.step(loss, grads, config.learning_rate)
+        return state, loss, loss, skipped
 
-    num_updates = -(-episodes.count // size)
-    state, tally = jax.lax.fori_loop(0, num_updates, update, (state, Tally.zero()))
-    return state, tally.stats
+    return run_updates(state, -(-episodes.count // size), update)
 
 
 def whole_episodes(
-    setup: RecurrentSetup,
-    data: FitData,
-    chosen: Int[Array, " episode"],
-    counted: Array,
+    task: Task, data: FitData, chosen: Int[Array, " episode"], counted: Bool[Array, " episode"]
 ) -> Window:
     """Some episodes from their first step; padding, and episodes not counted, weigh 0."""
     episodes = data.episodes
     obs, action = episodes.obs[chosen], episodes.action[chosen]
     valid = jnp.arange(action.shape[1]) < episodes.length[chosen][:, None]
     weight = (valid & counted[:, None]).astype(jnp.float32)
-    return Window.of(setup.task, data.statistics, (obs[:, :-1], action, obs[:, 1:]), weight)
+    return Window.of(task, data.statistics, (obs[:, :-1], action, obs[:, 1:]), weight)
 
 
 class ReBAL(Model):

@@ -24,8 +24,7 @@ from headway.models.base import (
     plan_layers,
 )
 from headway.models.multi_headed import MultiHeadDynamics, Statistics, network_input
-from headway.models.networks import Dense, DenseHeads, swish
-from headway.models.products import PRECISIONS
+from headway.models.networks import PRECISIONS, Dense, DenseHeads, swish
 from headway.planning.last_layer.learning import Learned, learn
 from headway.planning.last_layer.regression import Prior
 from headway.task import Task

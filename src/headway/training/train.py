@@ -14,7 +14,7 @@ from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import DivergenceError
 from headway.experiment.learners import Learned, make_learner
-from headway.models.updates import EpochStats
+from headway.models.fitting import EpochStats
 from headway.training.collect import (
     AgentPolicy,
     Environments,

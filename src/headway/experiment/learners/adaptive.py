@@ -11,11 +11,10 @@ from headway.config import GradientAdaptedConfig
 from headway.data import Trajectory
 from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
 from headway.models.base import Model
-from headway.models.fitting import FitData
-from headway.models.grbal import GrBAL, MetaSetup, ReluNet, meta_epoch
+from headway.models.fitting import EpochStats, FitData, FitState
+from headway.models.grbal import GrBAL, ReluNet, meta_epoch
 from headway.models.multi_headed import Statistics
-from headway.models.rebal import ReBAL, RecurrentNet, RecurrentSetup, recurrent_epoch
-from headway.models.updates import EpochStats, Fitted
+from headway.models.rebal import ReBAL, RecurrentNet, recurrent_epoch
 from headway.planning.agent import Agent
 from headway.training.collect import Environments
 
@@ -29,8 +28,8 @@ class Adaptive(Learner):
 
     @abc.abstractmethod
     def fit_epoch(
-        self, state: Fitted, data: FitData, key: PRNGKeyArray
-    ) -> tuple[Fitted, EpochStats]:
+        self, state: FitState, data: FitData, key: PRNGKeyArray
+    ) -> tuple[FitState, EpochStats]:
         """Go once through the data."""
 
     @abc.abstractmethod
@@ -39,7 +38,7 @@ class Adaptive(Learner):
 
     def initial(self, key: PRNGKeyArray) -> Learned:
         """See `Learner.initial`."""
-        state = Fitted.new(self.draw_net(key), self.config.fitting.learning_rate)
+        state = FitState.new(self.draw_net(key))
         return Learned(state, Statistics.identity(self.task, self.config.model.history_length))
 
     def fit(self, trajectories: list[Trajectory], iteration: int, key: PRNGKeyArray) -> Fit:
@@ -48,7 +47,7 @@ class Adaptive(Learner):
         statistics = Statistics.fit(self.task, trajectories, self.config.model.history_length)
         data = self.lay_out(trajectories, statistics, num_members=1, key=key)
 
-        def epochs(state: Fitted, first: int) -> Epochs:
+        def epochs(state: FitState, first: int) -> Epochs:
             for epoch in range(first, self.config.fitting.epochs):
                 state, stats = self.fit_epoch(state, data, jax.random.fold_in(key, epoch))
                 yield state, jax.device_get(stats)
@@ -73,27 +72,26 @@ class GradientAdaptation(Adaptive):
     """
 
     @property
-    def setup(self) -> MetaSetup:
-        """What fixes the compiled epoch."""
+    def inner_step(self) -> tuple[int, float]:
+        """Transitions that a gradient step adapts to, and its size."""
         model = self.config.model
         assert isinstance(model, GradientAdaptedConfig)
-        length, rate = model.adaptation_length, model.adaptation_rate
-        return MetaSetup(self.task, self.config.fitting, length, rate)
+        return model.adaptation_length, model.adaptation_rate
 
     def draw_net(self, key: PRNGKeyArray) -> ReluNet:
         """See `Adaptive.draw_net`."""
         return ReluNet.init(self.config.model, self.task, key=key)
 
     def fit_epoch(
-        self, state: Fitted, data: FitData, key: PRNGKeyArray
-    ) -> tuple[Fitted, EpochStats]:
+        self, state: FitState, data: FitData, key: PRNGKeyArray
+    ) -> tuple[FitState, EpochStats]:
         """See `Adaptive.fit_epoch`."""
-        return meta_epoch(state, self.setup, data, key=key)
+        length, rate = self.inner_step
+        return meta_epoch(state, self.setup, data, length=length, rate=rate, key=key)
 
     def acting_model(self, learned: Learned) -> GrBAL:
         """See `Adaptive.acting_model`."""
-        setup = self.setup
-        return GrBAL(learned.fit.model, learned.statistics, self.task, setup.length, setup.rate)
+        return GrBAL(learned.fit.model, learned.statistics, self.task, *self.inner_step)
 
 
 class Recurrence(Adaptive):
@@ -104,11 +102,10 @@ class Recurrence(Adaptive):
         return RecurrentNet.init(self.config.model, self.task, key=key)
 
     def fit_epoch(
-        self, state: Fitted, data: FitData, key: PRNGKeyArray
-    ) -> tuple[Fitted, EpochStats]:
+        self, state: FitState, data: FitData, key: PRNGKeyArray
+    ) -> tuple[FitState, EpochStats]:
         """See `Adaptive.fit_epoch`."""
-        setup = RecurrentSetup(self.task, self.config.fitting)
-        return recurrent_epoch(state, setup, data, key=key)
+        return recurrent_epoch(state, self.setup, data, key=key)
 
     def acting_model(self, learned: Learned) -> ReBAL:
         """See `Adaptive.acting_model`."""

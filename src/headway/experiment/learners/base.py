@@ -9,9 +9,8 @@ from jaxtyping import Float, PRNGKeyArray
 
 from headway.config import Config, override
 from headway.data import Episodes, Samples, Trajectory
-from headway.models.fitting import FitData, make_data
+from headway.models.fitting import EpochStats, FitData, FitSetup, make_data
 from headway.models.multi_headed import Statistics
-from headway.models.updates import EpochStats
 from headway.planning.agent import Agent
 from headway.task import Task
 from headway.training.collect import Environments
@@ -56,6 +55,11 @@ class Learner(abc.ABC):
         self.config = config
         self.task = task
         self.episode_length = episode_length
+
+    @property
+    def setup(self) -> FitSetup:
+        """Constants of the compiled epoch."""
+        return FitSetup(self.task, self.config.fitting, self.config.model.history_length)
 
     @abc.abstractmethod
     def initial(self, key: PRNGKeyArray) -> Learned:

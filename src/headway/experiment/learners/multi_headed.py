@@ -10,7 +10,7 @@ from jaxtyping import Float, PRNGKeyArray
 
 from headway.data import Episodes, Trajectory
 from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
-from headway.models.fitting import FitSetup, FitState, episode_losses, fit_epoch
+from headway.models.fitting import FitState, episode_losses, fit_epoch
 from headway.models.multi_headed import MultiHeadDynamics, Statistics
 from headway.planning.agent import Agent
 from headway.planning.heads import MultiHeadModel
@@ -23,17 +23,12 @@ from headway.training.methods import told_sim_params
 class MultiHeaded(Learner):
     """`MultiHeadDynamics`; heads are chosen while acting."""
 
-    @property
-    def setup(self) -> FitSetup:
-        """What fixes the compiled epoch."""
-        return FitSetup(self.task, self.config.fitting, self.config.model.history_length)
-
     def initial(self, key: PRNGKeyArray) -> Learned:
         """See `Learner.initial`."""
         config, names = self.config.model, told_sim_params(self.config)
         model = MultiHeadDynamics.init(config, self.task, sim_param_names=names, key=key)
         statistics = Statistics.identity(self.task, config.history_length, names)
-        return Learned(self.setup.init(model), statistics)
+        return Learned(FitState.new(model), statistics)
 
     def fit(self, trajectories: list[Trajectory], iteration: int, key: PRNGKeyArray) -> Fit:
         """See `Learner.fit`."""

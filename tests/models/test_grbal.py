@@ -10,18 +10,16 @@ from adaptive_helpers import TINY, random_window, toy_data
 
 import toys
 from headway.config import FittingConfig
+from headway.models.fitting import FitSetup, FitState
 from headway.models.grbal import (
-    MetaSetup,
     ReluNet,
     Window,
     adapt,
-    draw_moments,
     meta_epoch,
     meta_loss,
     squared_error,
     window,
 )
-from headway.models.updates import Fitted
 
 
 def tiny_net(seed=0, sizes=(5,), task=toys.POINT):
@@ -114,59 +112,47 @@ def test_the_outer_gradient_is_of_second_order():
     assert np.abs(second.output.weight - first.output.weight).max() > 1e-3
 
 
-def setup_of(**settings):
-    values = {"length": 4, "rate": 0.05, "batch_size": 64, "learning_rate": 3e-3, **settings}
-    fitting = FittingConfig(batch_size=values["batch_size"], learning_rate=values["learning_rate"])
-    return MetaSetup(toys.POINT, fitting, values["length"], values["rate"])
+def setup_of(batch_size=64, learning_rate=3e-3):
+    fitting = FittingConfig(batch_size=batch_size, learning_rate=learning_rate)
+    return FitSetup(toys.POINT, fitting, 1)
 
 
-def test_tasks_are_windows_around_a_moment_of_one_episode():
+def fit(state, setup, data, key=0, length=4, rate=0.05):
+    return meta_epoch(state, setup, data, length=length, rate=rate, key=jax.random.key(key))
+
+
+def test_windows_are_transitions_of_one_episode_and_weigh_nothing_outside():
     data, trajectories = toy_data([1.0, 2.0, 0.5])
-    setup = setup_of(batch_size=8 * 600)
-    episode, moment = draw_moments(data, setup, jax.random.key(1))
-    assert setup.num_tasks == 600
-    assert set(np.asarray(episode)) == {0, 1, 2}
-    assert (int(moment.min()), int(moment.max())) == (4, 39)  # a whole past, and every future
-    past = window(setup, data, episode, moment - setup.length)
-    future = window(setup, data, episode, moment)
-    assert past.weight.min() == 1
-    task = int(jnp.argmax(moment))
-    np.testing.assert_array_equal(future.weight[task], [1, 0, 0, 0])  # the episode ends there
-    source = trajectories[int(episode[task])]
-    np.testing.assert_allclose(past.x[task], np.c_[source.obs[35:39], source.action[35:39]])
-    np.testing.assert_allclose(future.delta[task, 0], source.obs[40] - source.obs[39], atol=1e-6)
-
-
-def test_an_episode_shorter_than_the_past_is_used_as_far_as_it_goes():
-    data, _ = toy_data([1.0], steps=3)
-    setup = setup_of()
-    episode, moment = draw_moments(data, setup, jax.random.key(1))
-    assert set(np.asarray(moment)) == {2}
-    past = window(setup, data, episode, moment - setup.length)
-    np.testing.assert_array_equal(past.weight[0], [0, 0, 1, 1])
+    episode, start = jnp.array([2, 0, 1]), jnp.array([39, -2, 10])
+    found = window(toys.POINT, data, episode, start, 4)
+    np.testing.assert_array_equal(found.weight, [[1, 0, 0, 0], [0, 0, 1, 1], [1, 1, 1, 1]])
+    source = trajectories[1]
+    np.testing.assert_allclose(found.x[2], np.c_[source.obs[10:14], source.action[10:14]])
+    last = trajectories[2].obs
+    np.testing.assert_allclose(found.delta[0, 0], last[40] - last[39], atol=1e-6)
 
 
 def test_an_epoch_sees_as_many_transitions_as_there_are():
     data, _ = toy_data([1.0, 2.0, 0.5])
-    state = Fitted.new(tiny_net(), 1e-3)
-    stats = meta_epoch(state, setup_of(), data, key=jax.random.key(0))[1]
+    state = FitState.new(tiny_net())
+    stats = fit(state, setup_of(), data)[1]
     assert (int(stats.updates), int(stats.skipped)) == (120 // 64, 0)
-    stats = meta_epoch(state, setup_of(batch_size=10_000), data, key=jax.random.key(0))[1]
+    stats = fit(state, setup_of(batch_size=10_000), data)[1]
     assert int(stats.updates) == 1
 
 
 def test_adapting_lowers_the_error_under_physics_that_were_never_seen():
     data, _ = toy_data([0.5, 1.0, 1.5, 2.0])
-    setup = setup_of(rate=0.1, length=8, learning_rate=1e-2)
-    state = Fitted.new(tiny_net(sizes=(32, 32)), setup.fitting.learning_rate)
+    setup = setup_of(learning_rate=1e-2)
+    state = FitState.new(tiny_net(sizes=(32, 32)))
     for epoch in range(150):
-        state, _ = meta_epoch(state, setup, data, key=jax.random.key(epoch))
+        state, _ = fit(state, setup, data, epoch, length=8, rate=0.1)
 
     @jax.jit
     def errors(transitions):
         whole = Window.of(setup.task, data.statistics, transitions, jnp.ones(16))
         past, future = (Window(*(x[part] for x in whole)) for part in (slice(8), slice(8, 16)))
-        adapted = adapt(state.model, past, setup.rate)
+        adapted = adapt(state.model, past, 0.1)
         return squared_error(state.model, future), squared_error(adapted, future)
 
     for gain in (0.25, 1.25):
@@ -180,7 +166,7 @@ def test_an_update_without_finite_numbers_is_skipped():
     data, _ = toy_data([1.0])
     net = tiny_net()
     broken = jax.tree.map(lambda x: x * jnp.nan, net)
-    state = Fitted.new(broken, 1e-3)
-    after, stats = meta_epoch(state, setup_of(), data, key=jax.random.key(0))
+    state = FitState.new(broken)
+    after, stats = fit(state, setup_of(), data)
     assert int(stats.skipped) == int(stats.updates) == 1
     assert int(after.optimizer[0].count) == 0

@@ -14,17 +14,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from headway.config import FittingConfig
-from headway.models.batches import Batch
-from headway.models.losses import HIDDEN_DECAY, sum_of_squares, weight_decay_loss
+from headway.models.losses import HIDDEN_DECAY, Batch, sum_of_squares, weight_decay_loss
 from headway.models.multi_headed import (
-    ContextEncoder,
-    GaussianNet,
     MultiHeadDynamics,
     Statistics,
     flat_history,
     network_input,
 )
-from headway.models.networks import Dense, swish
+from headway.models.networks import ContextEncoder, Dense, GaussianNet, swish
 from headway.task import Task
 
 

@@ -7,14 +7,13 @@ from adaptive_helpers import random_window, toy_data
 
 import toys
 from headway.config import FittingConfig, RecurrentConfig
+from headway.models.fitting import FitSetup, FitState
 from headway.models.grbal import Window
 from headway.models.rebal import (
     RecurrentNet,
-    RecurrentSetup,
     batch_gradient,
     recurrent_epoch,
 )
-from headway.models.updates import Fitted
 
 truncated = jax.jit(batch_gradient, static_argnums=2)
 
@@ -113,10 +112,10 @@ def test_a_truncated_gradient_stops_between_chunks_but_the_state_goes_on():
 
 def test_an_epoch_shows_every_episode_once_in_batches_of_whole_ones():
     data, _ = toy_data([1.0, 2.0, 0.5], steps=10)  # laid out in arrays of 13 steps
-    state = Fitted.new(tiny_net(), 1e-3)
+    state = FitState.new(tiny_net())
     updates = []
     for batch_size in (1, 26, 1000):
-        setup = RecurrentSetup(toys.POINT, FittingConfig(batch_size=batch_size, backprop_steps=5))
+        setup = FitSetup(toys.POINT, FittingConfig(batch_size=batch_size, backprop_steps=5), 1)
         stats = recurrent_epoch(state, setup, data, key=jax.random.key(0))[1]
         updates.append(int(stats.updates))
     assert updates == [3, 2, 1]
@@ -129,12 +128,12 @@ def test_an_epoch_shows_every_episode_once_in_batches_of_whole_ones():
 
 def test_memory_tells_physics_apart():
     data, trajectories = toy_data([0.5, 1.0, 1.5, 2.0], steps=24)
-    setup = RecurrentSetup(
-        toys.POINT, FittingConfig(batch_size=54, backprop_steps=12, learning_rate=1e-2)
+    setup = FitSetup(
+        toys.POINT, FittingConfig(batch_size=54, backprop_steps=12, learning_rate=1e-2), 1
     )
     config = RecurrentConfig(hidden_sizes=(24,))
     net = RecurrentNet.init(config, toys.POINT, key=jax.random.key(0))
-    state = Fitted.new(net, 1e-2)
+    state = FitState.new(net)
     for epoch in range(120):
         state, _ = recurrent_epoch(state, setup, data, key=jax.random.key(epoch))
     errors = []
