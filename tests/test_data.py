@@ -45,15 +45,6 @@ def test_history_at_every_step_of_ragged_episodes_equals_its_numpy_twin(length):
         np.testing.assert_array_equal(got.action[i], action)
 
 
-def test_history_fills_from_the_left_then_shifts():
-    action = np.arange(1.0, 6.0, dtype=np.float32)[:, None]
-    trajectory = Trajectory(np.zeros((6, 1), np.float32), action, np.zeros(5), {})
-    episodes = Episodes.pad([trajectory], capacity=1, max_length=5)
-    got = episodes.history(jnp.zeros(6, int), jnp.arange(6), 3).action[..., 0]
-    expected = [[0, 0, 0], [1, 0, 0], [1, 2, 0], [1, 2, 3], [2, 3, 4], [3, 4, 5]]
-    np.testing.assert_array_equal(got, expected)
-
-
 @pytest.mark.parametrize("length", [1, 4, 10])
 def test_history_action_moments_count_the_zeros_of_the_first_steps(length):
     trajectories = [toys.random_trajectory(n, seed=n) for n in RAGGED]
@@ -92,16 +83,6 @@ def test_sample_counts_follow_the_closed_formula(transitions):
     assert int(dropped.count) == 5 * transitions - 15  # the released code's count, with T - 1
 
 
-def test_an_episode_of_one_step_gives_one_sample_or_none_without_its_first_anchor():
-    assert int(Samples.table([1], 5, 4).count) == 1
-    assert int(Samples.table([1], 5, 4, drop_first=True).count) == 0
-
-
-def test_final_transition_is_among_the_samples():
-    samples = Samples.table([4], 1, 4)
-    assert 3 in np.asarray(samples.anchor)[: int(samples.count)]
-
-
 @given(st.integers(1, 25), st.integers(1, 8), st.integers(0, 25), st.integers(0, 1000))
 def test_segment_sums_equal_their_numpy_twin(steps, segment, num_valid, seed):
     values = np.random.default_rng(seed).normal(size=(2, steps)).astype(np.float32)
@@ -110,11 +91,6 @@ def test_segment_sums_equal_their_numpy_twin(steps, segment, num_valid, seed):
     twin = [[row[s : s + segment][valid[s : s + segment]].sum() for s in starts] for row in values]
     got = segment_sums(jnp.asarray(values), jnp.asarray(valid), segment)
     np.testing.assert_allclose(got, twin, rtol=1e-5, atol=1e-5)
-
-
-def test_segment_sums_ignore_nan_past_the_end():
-    values, valid = jnp.asarray([1.0, 2.0, jnp.nan]), jnp.asarray([True, True, False])
-    np.testing.assert_array_equal(segment_sums(values, valid, 2), [3.0, 0.0])
 
 
 def test_padding_keeps_each_episode_and_repeats_its_last_observation():

@@ -7,7 +7,6 @@ import pytest
 
 import headway
 import headway.envs
-from headway.config import differences
 from headway.data import Trajectory
 from headway.models.multi_headed import network_input
 from headway.training import loading, train
@@ -15,45 +14,6 @@ from headway.training.methods import make_config, told_sim_params
 
 NEW = ("stacked", "cadm", "pets-cadm", "oracle-params", "ria")
 TINY = {"collection.episode_length": 12, "fitting.epochs": 1}
-
-
-def settings_of(method, **kwargs):
-    config = make_config("half-cheetah", method=method, **kwargs)
-    return config.model, config.fitting, config.planner
-
-
-def test_cadm_has_its_own_choices():
-    for method in ("cadm", "pets-cadm"):
-        model, fitting, planner = settings_of(method)
-        assert (model.context, model.context_at, model.context_size) == ("learned", "input", 10)
-        assert (model.history_length, fitting.future_length) == (10, 10)
-        assert model.backward_net
-        assert model.deterministic or model.backward_deterministic
-        assert (fitting.oracle, fitting.backward_weight, fitting.batch_size) == (
-            "independent",
-            0.5,
-            256,
-        )
-        assert fitting.context_weight_decay
-        alone = method == "cadm"
-        assert (model.num_members, planner.num_particles) == ((1, 1) if alone else (5, 20))
-        assert model.deterministic == alone
-
-
-def test_ria_has_its_own_choices():
-    model, fitting, _ = settings_of("ria")
-    assert (model.num_heads, model.num_members, model.context_at) == (1, 5, "last-hidden")
-    assert model.relation_head
-    assert not model.backward_deterministic
-    assert (fitting.batch_size, fitting.future_length, fitting.backward_weight) == (200, 5, 0.5)
-    assert (fitting.relation_temperature, fitting.relation_distance_weight) == (0.6, 1.0)
-    assert fitting.relation_transitions == 0
-
-
-def test_stacked_is_vanilla_but_for_its_input():
-    stacked, vanilla = (make_config("pendulum", method=name) for name in ("stacked", "vanilla"))
-    changed = {line.partition(":")[0] for line in differences(vanilla, stacked)}
-    assert changed == {"method", "model.context", "model.context_at", "model.context_size"}
 
 
 def test_only_oracle_params_is_told_the_physics():

@@ -64,42 +64,6 @@ def test_a_segment_goes_to_the_head_that_is_best_on_the_whole_of_it():
     np.testing.assert_array_equal(single[0, 0], [0] * 9 + [1])
 
 
-def test_transition_oracle_is_the_trajectory_oracle_of_segments_of_one():
-    model = toys.small_model()
-    episodes, _ = toys.lay_out([toys.random_trajectory(9), toys.random_trajectory(4, 1)])
-    statistics = toys.odd_statistics()
-    transition = setup(oracle="transition", segment_length=10)
-    segments_of_one = setup(oracle="trajectory", segment_length=1)
-    assert transition.segment_length == 1
-    for a, b in zip(
-        assign_segments(model, transition, episodes, statistics),
-        assign_segments(model, segments_of_one, episodes, statistics),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(a, b)
-
-
-def test_permuting_the_models_heads_permutes_its_assignments():
-    model, statistics = toys.small_model(), toys.odd_statistics()
-    trajectories = [toys.random_trajectory(9, seed=i, gain=i) for i in range(6)]
-    episodes, _ = toys.lay_out(trajectories)
-
-    def swap(net):
-        heads = [
-            dataclasses.replace(h, weight=h.weight[:, ::-1], bias=h.bias[:, ::-1])
-            for h in (net.mean_heads, net.logvar_heads)
-        ]
-        bounds = net.max_logvar[::-1], net.min_logvar[::-1]
-        return type(net)(net.hidden, *heads, *bounds)
-
-    swapped = type(model)(swap(model.forward_net), swap(model.backward_net), model.context_encoder)
-    before = assign_segments(model, setup(segment_length=3), episodes, statistics)
-    after = assign_segments(swapped, setup(segment_length=3), episodes, statistics)
-    for a, b in zip(before, after, strict=True):
-        assert {0, 1} == set(np.unique(a[:, :6]))
-        np.testing.assert_array_equal(a[:, :6], 1 - b[:, :6])
-
-
 def test_directions_are_assigned_independently():
     found = assign_segments(
         toys.small_model(),
@@ -162,10 +126,3 @@ def test_bootstrap_draws_valid_samples_with_replacement_anew_for_each_member():
     distinct = [len(set(row)) / count for row in rows]
     assert all(0.45 < share < 0.8 for share in distinct)  # 1 - 1/e of all samples
     assert (rows[0] != rows[1]).any()
-
-
-@pytest.mark.parametrize(("members", "bootstrap"), [(1, True), (2, False)])
-def test_one_member_or_no_bootstrap_uses_every_sample(members, bootstrap):
-    config = FittingConfig(bootstrap=bootstrap)
-    data = data_of([toys.random_trajectory(5)], members=members, config=config)
-    np.testing.assert_array_equal(data.rows, np.tile(np.arange(data.rows.shape[1]), (members, 1)))

@@ -2,16 +2,14 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import toys
-from headway.config import MultiHeadedConfig
 from headway.data import Episodes, History
 from headway.errors import ConfigError
-from headway.models.multi_headed import MultiHeadDynamics, Statistics, context_size
+from headway.models.multi_headed import Statistics, context_size
 
 PLACES = ["input", "last-hidden", "head"]
 KINDS = ["learned", "history", "sim-params"]
@@ -81,14 +79,6 @@ def test_a_learned_context_of_no_width_is_none():
     assert model.context(told_history()[0], toys.odd_statistics()) is None
 
 
-def test_a_deterministic_backward_net_leaves_the_forward_net_probabilistic():
-    config = dataclasses.replace(toys.SMALL, backward_deterministic=True)
-    model = MultiHeadDynamics.init(config, toys.POINT, key=jax.random.key(0))
-    assert model.forward_net.logvar_heads is not None
-    assert model.backward_net.logvar_heads is None
-    assert model.backward_net.min_logvar is None
-
-
 def test_simulator_parameters_are_normalised_over_all_transitions():
     lengths, gains = (1, 6, 4), (0.5, 2.0, -1.0)
     trajectories = [toys.random_trajectory(n, gain=g) for n, g in zip(lengths, gains, strict=True)]
@@ -111,18 +101,3 @@ def test_episodes_carry_the_parameters_that_a_model_is_told_and_no_others():
     assert Episodes.pad(trajectories, 3, 5).sim_params.shape == (3, 0)
     with pytest.raises(ConfigError, match="lack drag, allowed: a value for each of gain, drag"):
         Episodes.pad(trajectories, 3, 5, NAMES)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"context": "histroy"}, "did you mean 'history'"),
-        ({"context_at": "heads"}, "did you mean 'head'"),
-        ({"relation_head": True}, "allowed: one head and a learned context"),
-        ({"relation_head": True, "num_heads": 1, "context_size": 0}, "one head and a learned"),
-        ({"relation_head": True, "num_heads": 1, "context": "history"}, "one head and a learned"),
-    ],
-)
-def test_settings_that_contradict_each_other_are_refused(settings, message):
-    with pytest.raises(ConfigError, match=message):
-        MultiHeadedConfig(**settings)

@@ -75,21 +75,6 @@ def test_every_switch_of_the_model_builds_and_predicts(switches):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(prediction))
 
 
-def test_members_heads_and_directions_start_different():
-    model = MultiHeadDynamics.init(toys.SMALL, TASK, key=jax.random.key(0))
-    weight = np.asarray(model.forward_net.mean_heads.weight)
-    assert (weight[0] != weight[1]).all()
-    assert (weight[:, 0] != weight[:, 1]).all()
-    assert (weight != np.asarray(model.backward_net.mean_heads.weight)).all()
-    assert (weight != np.asarray(model.forward_net.logvar_heads.weight)).all()
-
-
-def test_initial_variance_bounds_are_a_half_and_minus_ten():
-    net = MultiHeadDynamics.init(toys.SMALL, TASK, key=jax.random.key(0)).forward_net
-    assert (np.asarray(net.max_logvar) == 0.5).all()
-    assert (np.asarray(net.min_logvar) == -10.0).all()
-
-
 def test_statistics_equal_their_numpy_twins_over_ragged_episodes():
     trajectories = [toys.random_trajectory(n, seed=n) for n in (1, 6, 4)]
     statistics = Statistics.fit(TASK, trajectories, 3)
@@ -107,18 +92,3 @@ def test_statistics_equal_their_numpy_twins_over_ragged_episodes():
         np.testing.assert_allclose(normalizer.mean, values.mean(0), rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(normalizer.std, values.std(0), rtol=1e-5, atol=1e-6)
     assert statistics.history_action.mean.shape == (3, 2)
-
-
-def test_state_differences_enter_the_encoder_unnormalised():
-    model, statistics = toys.small_model(task=TASK), toys.odd_statistics(TASK)
-    _, _, history = random_input()
-    other = dataclasses.replace(statistics, delta=Statistics.identity(TASK, 3).delta)
-    np.testing.assert_array_equal(model.context(history, statistics), model.context(history, other))
-
-
-def test_a_slot_that_is_never_filled_gives_a_finite_context():
-    trajectories = [toys.random_trajectory(2, seed=n) for n in range(3)]
-    statistics = Statistics.fit(TASK, trajectories, 3)
-    assert not np.asarray(statistics.history_action.std[1:]).any()
-    _, _, history = random_input()
-    assert np.isfinite(toys.small_model(task=TASK).context(history, statistics)).all()

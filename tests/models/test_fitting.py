@@ -144,14 +144,6 @@ def test_a_constant_observation_dimension_and_one_step_episodes_give_no_nan():
     assert np.isfinite(losses).all()
 
 
-def test_a_data_set_of_one_transition_can_be_fitted():
-    state, setup, data = small_fit(trajectories=[toys.random_trajectory(1)])
-    assert int(data.samples.count) == 1
-    state, stats = fit_epoch(state, setup, data, independent=False, key=jax.random.key(0))
-    assert (int(stats.updates), int(stats.skipped)) == (1, 0)
-    assert_finite(state)
-
-
 def test_a_batch_larger_than_the_data_equals_a_batch_of_just_the_data():
     state, _, data = small_fit(switches=PLAIN)
     count = int(data.samples.count)

@@ -96,22 +96,6 @@ def test_inner_and_outer_gradients_equal_finite_differences(rate):
                 np.testing.assert_allclose(gradient[index], expected, rtol=2e-3, atol=2e-5)
 
 
-def test_the_outer_gradient_is_of_second_order():
-    net, past, future = tiny_net(), random_window(1, 3, 6), random_window(2, 3, 6)
-
-    def first_order(net):
-        def of_task(past, future):
-            steps = jax.lax.stop_gradient(jax.grad(squared_error)(net, past))
-            stepped = jax.tree.map(lambda w, g: w - 0.2 * g, net, steps)
-            return squared_error(stepped, future)
-
-        return jax.vmap(of_task)(past, future).mean()
-
-    second = jax.grad(meta_loss)(net, past, future, 0.2)
-    first = jax.grad(first_order)(net)
-    assert np.abs(second.output.weight - first.output.weight).max() > 1e-3
-
-
 def setup_of(batch_size=64, learning_rate=3e-3):
     fitting = FittingConfig(batch_size=batch_size, learning_rate=learning_rate)
     return FitSetup(toys.POINT, fitting, 1)

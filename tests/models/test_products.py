@@ -9,11 +9,9 @@ import pytest
 
 import toys
 from headway.config import FittingConfig, MultiHeadedConfig
-from headway.errors import ConfigError
 from headway.models.fitting import FitSetup, FitState, episode_losses, fit_epoch, make_data
 from headway.models.multi_headed import MultiHeadDynamics, Statistics
 from headway.models.networks import affine, rounded
-from headway.training.methods import make_config
 
 TWO_LAYERS = MultiHeadedConfig(
     num_members=2, num_heads=2, hidden_sizes=(8, 8), context_size=3, context_hidden_sizes=(5,)
@@ -70,11 +68,6 @@ def test_heads_are_assigned_by_the_model_that_is_fitted():
     reduced = losses(model, "bfloat16")
     np.testing.assert_array_equal(reduced, losses(model.in_precision("bfloat16"), "float32"))
     assert (reduced != losses(model, "float32")).any()
-
-
-def test_a_relation_head_is_fitted_in_float32_alone():
-    with pytest.raises(ConfigError, match="precision is 'bfloat16', allowed: float32"):
-        make_config("pendulum", method="ria", settings={"fitting.precision": "bfloat16"})
 
 
 @pytest.mark.parametrize("deterministic", [False, True])

@@ -55,12 +55,6 @@ def test_steps_equal_a_numpy_twin():
     np.testing.assert_allclose(rollout(net, xs), expected, rtol=1e-4, atol=1e-6)
 
 
-def test_forget_gates_begin_open():
-    config = RecurrentConfig(hidden_sizes=(3,))
-    (layer,) = RecurrentNet.init(config, toys.POINT, key=jax.random.key(0)).layers
-    np.testing.assert_array_equal(layer.bias[0], [0] * 3 + [1] * 3 + [0] * 6)
-
-
 @jax.jit
 def whole_loss(net, batch):
     errors = jnp.square(rollout(net, batch.x) - batch.delta).mean(-1)

@@ -15,12 +15,10 @@ from headway.models.fitting import FitSetup, FitState, fit_epoch, gather_batch, 
 from headway.models.losses import HIDDEN_DECAY, Batch
 from headway.models.multi_headed import MultiHeadDynamics, Statistics, network_input
 from headway.models.ria import (
-    Pairs,
     intervene,
     intervention_distance,
     relation_decay_loss,
     relation_gradient,
-    relation_loss,
     relation_parts,
 )
 
@@ -105,38 +103,6 @@ def test_contexts_are_compared_right_wherever_they_join(place):
     got = intervention_distance(model.forward_net, x, batch.weight, context)
     expected = distances_twin(model, batch, range(SAMPLES))[0]
     np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-5)
-
-
-def test_gradient_of_the_pull_equals_finite_differences():
-    model, batch = toys.small_model(config=RIA), random_batch()
-
-    def pull(shift):
-        encoder = model.context_encoder
-        moved = dataclasses.replace(encoder.output, bias=encoder.output.bias + shift)
-        encoder = dataclasses.replace(encoder, output=moved)
-        spread = dataclasses.replace(
-            encoder.output, weight=encoder.output.weight * (1 + shift.sum())
-        )
-        encoder = dataclasses.replace(encoder, output=spread)
-        changed = dataclasses.replace(model, context_encoder=encoder)
-        return intervene(changed, toys.POINT, STATISTICS, batch, CONFIG)[0]
-
-    zero = jnp.zeros(3)
-    step = 1e-2 * jnp.array([1.0, 0.5, -0.3])
-    slope = (pull(zero + step) - pull(zero - step)) / 2
-    np.testing.assert_allclose(jax.grad(pull)(zero) @ step, slope, rtol=2e-2)
-
-
-def test_contexts_of_one_trajectory_are_certainly_the_same():
-    model, batch = toys.small_model(config=RIA), random_batch()
-    parts, pairs = (
-        relation_parts(model),
-        Pairs.of(batch._replace(trajectory=jnp.zeros((2, 5), int))),
-    )
-    context = model.context(batch.history, STATISTICS)
-    nothing, all_alike = jnp.zeros((2, 5, 5)), jnp.ones((2, 5, 5))
-    first, second = (relation_loss(parts.head, context, s, pairs) for s in (nothing, all_alike))
-    np.testing.assert_allclose(first, second)
 
 
 def test_padding_changes_nothing():
