@@ -128,19 +128,19 @@ class Train(Command):
     env: EnvName = tyro.MISSING
     """Short name or id of an environment; `headway list envs` shows them."""
     method: str = "tmcl"
-    """What to train; `headway list methods` shows the choice."""
+    """Method; `headway list methods` shows the choice."""
     preset: str = "paper"
     """At which scale; `headway list presets` shows the choice."""
     seed: int = 0
     """Makes the run repeatable."""
     run_dir: Annotated[Path | None, _unless_given("runs/ENV-METHOD-PRESET-seedSEED")] = None
-    """Where everything is written."""
+    """Directory of the run."""
     sim_params: Annotated[Path | None, _unless_given("the environment's own")] = None
     """A JSON file with the training and unseen physics."""
     env_options: Annotated[tuple[str, ...], _unless_given("those of the preset")] = ()
     """Switches of the environment: NAME=on or NAME=off."""
     resume_from_last_good: Flag = False
-    """Where a file of the run is damaged, go back to the newest iteration that is intact."""
+    """If a file of the run is damaged, go back to the newest iteration that is intact."""
     model: ModelConfig = MultiHeadedConfig()
     fitting: FittingConfig = FittingConfig()
     planner: PlannerConfig = PlannerConfig()
@@ -399,7 +399,7 @@ class _Runs(Command):
     preset: str = "paper"
     """At which scale; `headway list presets` shows the choice."""
     out: Path = Path("runs/reproduce")
-    """Where runs and results go; runs that are there already are used."""
+    """Folder of runs and results; runs that are there already are used."""
     settings: Annotated[tuple[str, ...], _unless_given("none")] = ()
     """Settings as NAME=VALUE, for example collection.num_iterations=3; `headway sweep` takes
     several values, for example planner.horizon=10,20, and combines them all."""
@@ -506,7 +506,7 @@ class List(Command):
         Literal["envs", "methods", "presets", "experiments"],
         tyro.conf.Positional,
     ] = tyro.MISSING
-    """What to list."""
+    """Names to list."""
 
     def run(self, words):
         """Print a table of names."""

@@ -91,7 +91,7 @@ class ModelConfig:
 
     kind: Any  # a Literal in each class
     learns: bool = True
-    """Whether there is anything to fit."""
+    """False where nothing is fitted."""
     num_members: int = 1
     num_heads: int = 1
     hidden_sizes: tuple[int, ...] = (0,)
@@ -119,10 +119,10 @@ class MultiHeadedConfig(ModelConfig):
     hidden_sizes: Widths = (200, 200, 200, 200)
     """Widths of the backbone's hidden layers."""
     context: ContextKind = "learned"
-    """What tells the networks of the hidden physics: `learned` is the context encoder's vector,
-    `history` the encoder's input as it is, `sim-params` the true simulator parameters."""
+    """Source of the networks' knowledge of the hidden physics: `learned` is the context encoder's
+    vector, `history` the encoder's input as it is, `sim-params` the true simulator parameters."""
     context_at: Literal["input", "last-hidden", "head"] = "head"
-    """Where the context joins: the networks' `input`, the `last-hidden` layer, or each `head`."""
+    """Layer that the context joins: the networks' `input`, the `last-hidden` one, or each `head`."""
     context_size: CountOrNone = 10
     """Width of a `learned` context; 0 builds no context encoder, and the networks see none."""
     context_hidden_sizes: Widths = (256, 128, 64)
@@ -130,13 +130,13 @@ class MultiHeadedConfig(ModelConfig):
     history_length: Count = 10
     """Past transitions that enter the context encoder (K)."""
     backward_net: Flag = True
-    """Whether a second network predicts backwards in time, to shape the context (A.4)."""
+    """A second network predicts backwards in time, to shape the context (A.4)."""
     deterministic: Flag = False
-    """Whether heads predict a mean only and are fitted to the squared error."""
+    """Heads predict a mean only and are fitted to the squared error."""
     backward_deterministic: Flag = False
-    """Whether the backward net is deterministic even where the forward net is not (CaDM)."""
+    """The backward net is deterministic even where the forward net is not (CaDM)."""
     relation_head: Flag = False
-    """Whether a linear layer learns to tell which contexts come from the same trajectory, and
+    """A linear layer learns to tell which contexts come from the same trajectory, and
     thereby shapes the context (RIA); wants one head and a `learned` context."""
 
     def __post_init__(self):
@@ -213,10 +213,10 @@ BUILT_IN_KINDS = tuple(MODELS)
 
 @settings
 class FittingConfig:
-    """How the model is fitted to the data after each collection (supplement A.2, A.4)."""
+    """Fitting of the model to the data after each collection (supplement A.2, A.4)."""
 
     oracle: Literal["independent", "transition", "trajectory"] = "trajectory"
-    """How losses are reduced over heads once the warm-up is over."""
+    """Reduction of the losses over heads once the warm-up is over."""
     segment_length: Count = 10
     """Consecutive transitions that share a winning head (M); used by `trajectory`."""
     warmup_iterations: CountOrNone = 3
@@ -227,9 +227,9 @@ class FittingConfig:
     """Samples per member and update. Gradient-adapted: transitions per update, half of them to
     adapt to. Recurrent: transitions per update, in whole episodes, at least one."""
     precision: Precision = "float32"
-    """What the networks multiply while fitting, forwards and backwards. Sums, weights and Adam are
-    always float32, and so are the first layers of the networks that predict. bfloat16 is faster
-    where the processor multiplies it; RIA cannot use it."""
+    """Type of the networks' products while fitting, forwards and backwards. Sums, weights and Adam
+    are always float32, and so are the first layers of the networks that predict. bfloat16 is
+    faster where the processor multiplies it; RIA cannot use it."""
     learning_rate: Rate = 1e-3
     """Adam's step size."""
     future_length: Count = 5
@@ -237,7 +237,7 @@ class FittingConfig:
     backprop_steps: Count = 100
     """Steps that the gradient flows back through time (recurrent; ReBAL)."""
     max_rollbacks: CountOrNone = 3
-    """How often in an iteration a diverging epoch is made again, each time with a quarter step."""
+    """Most times in an iteration that a diverging epoch is made again, each with a quarter step."""
     backward_weight: Weight = 0.5
     """Weight of the backward net's loss (released code)."""
     logvar_bound_weight: Weight = 0.01
@@ -245,12 +245,12 @@ class FittingConfig:
     weight_decay: Weight = 1.0
     """Factor on the released code's per-layer weight decay (2.5e-5 to 1e-4)."""
     context_weight_decay: Flag = True
-    """Whether the context encoder decays too; the released code forgets it."""
+    """The context encoder decays too; the released code forgets it."""
     reduction: Literal["head", "segment"] = "head"
     """Oracle loss: `head` averages within each head and sums over heads (released code);
     `segment` is the plain average (the paper's equation 2)."""
     bootstrap: Flag = False
-    """Whether each member draws its own samples with replacement (released code, not paper)."""
+    """Each member draws its own samples with replacement (released code, not paper)."""
     relation_temperature: Positive = 0.6
     """Softness of the weights exp(-distance / temperature) with which contexts of different
     trajectories count as the same where they predict the same (RIA)."""
@@ -260,7 +260,7 @@ class FittingConfig:
     """Transitions of a batch on which all its contexts are compared; 0 takes the whole batch, as
     RIA does. The time of an update grows with it."""
     drop_first_anchor: Flag = False
-    """Whether the first anchor of every trajectory is left out (a defect of the released code)."""
+    """The first anchor of every trajectory is left out (a defect of the released code)."""
 
 
 class OptimizerConfig:
@@ -338,10 +338,10 @@ OPTIMIZERS: dict[str, type[OptimizerConfig]] = {
 
 @settings
 class PlannerConfig:
-    """How actions are chosen with the model (supplement A.2)."""
+    """Choice of actions with the model (supplement A.2)."""
 
     optimizer: Annotated[OptimizerConfig, _tagged(OPTIMIZERS, "name")] = CEMConfig()
-    """What searches for the best action sequence."""
+    """Search for the best action sequence."""
     horizon: Count = 30
     """Imagined steps."""
     num_candidates: Count = 200
@@ -351,23 +351,23 @@ class PlannerConfig:
     num_particles: Count = 20
     """Imagined rollouts per candidate; a multiple of `model.num_members`."""
     particle_noise: Literal["independent", "shared"] = "independent"
-    """Whether every candidate draws its own noise, or all share that of their particles: faster,
-    and candidates are compared under equal luck."""
+    """Noise of imagined steps: every candidate's own, or shared by all, which is faster and
+    compares candidates under equal luck."""
     precision: Precision = "float32"
-    """What the networks multiply while planning; sums and states are always float32."""
+    """Type of the networks' products while planning; sums and states are always float32."""
     head_selection: Literal["adaptive", "average", "random"] = "adaptive"
-    """Which head plans: the best on recent transitions, their average, or a random one."""
+    """Head that plans: the best on recent transitions, their average, or a random one."""
     selection_length: Count = 10
     """Past transitions on which heads compete (N)."""
     selection_error: Literal["mean", "sampled"] = "mean"
     """Error of the predicted mean in normalised units, or (released code) of samples in raw
     units."""
     selection_skips_newest: Flag = False
-    """Whether the newest transition is not used to select heads (released code)."""
+    """The newest transition is not used to select heads (released code)."""
     reward: Literal["task", "released"] = "task"
     """The environment's own reward, or the one that the released code plans with."""
     adaptation: Literal["none", "last-layer"] = "none"
-    """Whether heads keep learning while they act: `last-layer` corrects their means by Bayesian
+    """Learning of the heads while they act: `last-layer` corrects their means by Bayesian
     regression on the episode so far. Its prior comes from the training data."""
     change_threshold: Weight = 0.0
     """Log Bayes factor for changed physics above which the corrections are dropped; 0 never does
@@ -388,7 +388,7 @@ class PlannerConfig:
 
 @settings
 class CollectionConfig:
-    """How much data is collected (supplement A.2)."""
+    """Amount of data that is collected (supplement A.2)."""
 
     num_iterations: Count = 10
     """Rounds of collecting and fitting; the first one acts at random."""
@@ -400,7 +400,7 @@ class CollectionConfig:
     """Most episodes of an iteration that are dropped because they broke: a number was not finite,
     a simulation diverged, a process hung or died."""
     env_processes: Flag = False
-    """Whether every environment runs in a process of its own, also in tests, so that one that
+    """Every environment runs in a process of its own, also in tests, so that one that
     hangs or crashes costs its episode only; slower where steps are quick."""
     step_timeout_s: Annotated[float, Field(strict=True, ge=1e-3, le=1e6)] = 60.0
     """Seconds that a step or reset may take before its process is given up (env_processes)."""
@@ -408,7 +408,7 @@ class CollectionConfig:
 
 @settings
 class EvaluationConfig:
-    """How controllers are tested; test episodes have fixed seeds, the same for every method."""
+    """Tests of controllers; test episodes have fixed seeds, the same for every method."""
 
     every: Count = 1
     """Iterations between tests on the unseen groups; the last iteration is always tested."""
@@ -492,7 +492,7 @@ TOLERANCE = (
     "collection.step_timeout_s",
     "evaluation.max_bad_episodes",
 )
-"""What is done about environments that break; the numbers of sound episodes do not depend on it,
+"""Settings about environments that break; the numbers of sound episodes do not depend on it,
 so a run may go on with other values."""
 
 
