@@ -14,7 +14,7 @@ CONSTRAINED_PYTHONS ?= python3.11 python3.12
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help demo test test-slow lint docs constraints clean
-.PHONY: bench bench-save bench-growth bench-peers bench-runs profile
+.PHONY: bench bench-peers
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' Makefile | awk -F'|' '{ printf "make %-14s %s\n", $$1, $$2 }'
@@ -37,20 +37,8 @@ lint: $(VENV)/test.stamp $(VENV)/lint.stamp ## Check style, types and import rul
 bench: $(VENV)/test.stamp $(VENV)/bench.stamp ## Time planning, fitting and environments; wants an idle machine
 	@$(BIN)/python -m pytest benchmarks -o python_files='bench_*.py' -p no:xdist --benchmark-quiet
 
-bench-save: $(VENV)/main.stamp ## Copy the latest results to results/speed/KIND/DATE.*
-	@$(BIN)/python benchmarks/save.py
-
-bench-growth: $(VENV)/main.stamp ## Measure how cost grows with environments, candidates, data, ... (6 minutes)
-	@$(BIN)/python benchmarks/growth.py
-
 bench-peers: $(VENV)/main.stamp $(PEERS)/peers.stamp ## Time a plan of mbrl-lib beside Headway's; installs PyTorch
 	@$(BIN)/python benchmarks/peers/compare.py --peer-python $(PEERS)/bin/python
-
-bench-runs: $(VENV)/main.stamp ## Time the paper's whole HalfCheetah and Pendulum runs; wants a GPU
-	@$(BIN)/python benchmarks/time_runs.py
-
-profile: $(VENV)/main.stamp ## Print what share of a plan its parts take
-	@$(BIN)/python benchmarks/profile_plan.py
 
 docs: $(VENV)/test.stamp $(VENV)/docs.stamp ## Check links; write the site, guides and API reference, to site/
 	@$(BIN)/python -m pytest tests/test_package.py -k links

@@ -6,9 +6,8 @@ from typing import Any
 
 import jax
 import pytest
-from rates import Rate, reference_rate
-from reporting import LATEST, Report
-from targets import TARGETS
+from machine import Rate, reference_rate
+from reporting import LATEST, TARGETS, Report
 
 REPORT = pytest.StashKey[Report]()
 

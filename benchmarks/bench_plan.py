@@ -1,8 +1,10 @@
 """One planning step at the paper's HalfCheetah size: its time, its memory, its first call."""
 
 import os
+import statistics
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -53,6 +55,16 @@ def test_first_plan(report, tmp_path):
             "s",
             key=f"first-plan-{key}",
         )
+
+
+def test_import(report):
+    """What a controller imports, in new processes."""
+    seconds = []
+    for _ in range(5):
+        begun = time.perf_counter()
+        subprocess.run([sys.executable, "-c", "import headway; headway.load"], check=True)
+        seconds.append(time.perf_counter() - begun)
+    report.add("a process that imports headway.load", statistics.median(seconds), "s")
 
 
 def first_plan(num_envs: int, environment: dict[str, str]) -> dict[str, float]:

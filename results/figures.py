@@ -1,0 +1,243 @@
+"""Tables and figures of this folder, made from its CSV files.
+
+    python results/figures.py scores results/pendulum-quick
+    python results/figures.py scores results/pendulum-quick --same-episodes results/ceilings
+    python results/figures.py returns results/cartpole-500-quick
+    python results/figures.py arms results/adaptation/pendulum-quick NAME.png
+    python results/figures.py changes results/adaptation/changes/pendulum NAME.png
+    python results/figures.py planners results/planners/pendulum.csv results/planners/pendulum.png
+    python results/figures.py ceilings results/ceilings
+
+Tables are printed as Markdown; a PNG file is drawn where one is named. `scores` and `returns` take
+a folder of METHOD/seed-N, `arms` and `changes` one table per run, `planners` one table.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from headway.lab import figures
+from headway.training.references import normalised, score
+from headway.training.run import parse_sim_params
+
+COLORS = (figures.FAINT, *figures.LABELS)
+PLACE = ["group", "episode", "sim_params"]  # what two runs of the same test episode share
+
+
+def markdown(table: pd.DataFrame) -> None:
+    """Print a table, its index as the first columns."""
+    flat = table.reset_index()
+    heads = [" ".join(name) if isinstance(name, tuple) else name for name in flat.columns]
+    for cells in [heads, ["---"] * len(heads), *flat.values.tolist()]:
+        print("|", " | ".join(map(str, cells)), "|")
+
+
+def each(values: pd.Series, digits: int = 2) -> str:
+    """The value of every run."""
+    return " ".join(f"{value:.{digits}f}" for value in values)
+
+
+def last_tests(path: Path) -> pd.DataFrame:
+    """Test episodes after the last iteration of a run."""
+    table = pd.read_csv(path)
+    return table[table.iteration == table.iteration.max()]
+
+
+def kept_tests(folder: Path) -> pd.DataFrame:
+    """Last test episodes of all runs in METHOD/seed-N of a folder."""
+    tables = {
+        (path.parts[-3], path.parts[-2]): last_tests(path)
+        for path in sorted(folder.glob("*/seed-*/evaluation.csv"))
+    }
+    found = pd.concat(tables, names=["arm", "run"]).reset_index(["arm", "run"])
+    found["physics"] = np.where(found.group == "train", "training", "unseen")
+    return found
+
+
+def scores(folder: Path, figure: Path | None, reference: Path | None) -> None:
+    """Score of each run by method: 0 is random, 1 the paper's planner on the true dynamics.
+
+    With `reference`, a folder of their tests, they are what both earned in the very episodes.
+    """
+    tests = kept_tests(folder)
+    length = int(tests.length.max())
+    if reference:
+        for name in ("random", "true-dynamics"):
+            their = last_tests(reference / f"{tests.env.iloc[0]}-{name}.csv")
+            earned = their[[*PLACE, "return"]].rename(columns={"return": name})
+            tests = tests.merge(earned, on=PLACE)
+        keys = ["arm", "run", "physics", "sim_params"]
+        means = tests.groupby(keys)[["return", "random", "true-dynamics"]].mean()
+        tests = means.apply(lambda row: normalised(*row), axis=1).rename("score").reset_index()
+    else:
+        tests["score"] = [
+            score(env, parse_sim_params(physics), earned, length)
+            for env, physics, earned in zip(
+                tests.env, tests.sim_params, tests["return"], strict=True
+            )
+        ]
+    by_run = tests.groupby(["arm", "physics", "run", "sim_params"]).score.mean()
+    by_run = by_run.groupby(["arm", "physics", "run"]).mean()
+    table = by_run.groupby(["arm", "physics"]).agg([each, lambda v: f"{v.mean():.2f}"])
+    table.columns = ["each run", "mean"]
+    order = by_run.xs("unseen", level="physics").groupby("arm").mean().sort_values(ascending=False)
+    markdown(table.unstack("physics").swaplevel(axis=1).sort_index(axis=1).loc[order.index])
+
+
+def returns(folder: Path, figure: Path | None, reference: Path | None) -> None:
+    """Return of each run under each physics, by method."""
+    tests = kept_tests(folder)
+    by_run = tests.groupby(["arm", "physics", "sim_params", "run"])["return"].mean()
+    table = by_run.groupby(["physics", "sim_params", "arm"]).agg(lambda v: each(v, 0))
+    markdown(table.unstack("arm"))
+
+
+def two_panels(
+    table: pd.DataFrame, panels: list[str], value: str, figure: Path, title: str
+) -> None:
+    """Draw a row per method and a color per arm: a dot per run, a bar at the mean.
+
+    Args:
+        table: Columns method, arm, panel, run, value.
+        panels: What is drawn on the left and on the right.
+        value: Label of the horizontal axis.
+        figure: The PNG file.
+        title: Stands above.
+    """
+    counts = table.groupby("method").arm.nunique()
+    table = table[table.method.isin(counts.index[counts > 1])]
+    means = table[table.panel == panels[-1]].groupby(["method", "arm"])["value"].mean()
+    methods = list(means.groupby("method").max().sort_values(ascending=False).index)
+    shared = table.groupby("arm").method.nunique() == len(methods)
+    arms = [arm for arm in table.arm.unique() if shared[arm]]
+    looks = {arm: {"color": color} for arm, color in zip(arms, COLORS, strict=False)}
+    caption = (
+        "A dot is one run, a bar the mean over runs. Same trained models and same episodes for"
+        " all arms; no number was chosen on unseen physics."
+    )
+    size = (8.0, 1.9 + 0.45 * len(methods))
+    with figures.figure(figure, title=title, caption=caption, size=size) as drawing:
+        for axes, panel in zip(drawing.subplots(1, 2, sharey=True), panels, strict=True):
+            for row, method in enumerate(methods):
+                for place, arm in enumerate(arms):
+                    own = (table.method == method) & (table.arm == arm) & (table.panel == panel)
+                    y, found = row + 0.2 * (place - (len(arms) - 1) / 2), table[own]["value"]
+                    axes.plot(found, [y] * len(found), "o", ms=4, alpha=0.6, **looks[arm])
+                    axes.plot(found.mean(), y, "|", ms=11, mew=2.5, **looks[arm])
+            axes.set_yticks(range(len(methods)), methods)
+            axes.set_ylim(len(methods) - 0.5, -0.5)
+            figures.numbers(axes, x=value.format(panel))
+        names = {"none": "frozen heads", "last-layer": "heads that learn"}
+        marks = {"marker": "o", "linestyle": ""}
+        figures.legend(drawing, {names.get(arm, arm): {**looks[arm], **marks} for arm in arms})
+
+
+def arms(folder: Path, figure: Path | None, reference: Path | None) -> None:
+    """Score of trained runs with frozen heads and with heads that learn, by method."""
+    table = pd.concat([pd.read_csv(path) for path in sorted(folder.glob("*.csv"))])
+    table["panel"] = np.where(table.group == "train", "training", "unseen")
+    runs = table.groupby(["method", "arm", "panel", "run"], sort=False).score.mean()
+    cells = runs.groupby(["method", "arm", "panel"], sort=False).agg(
+        lambda v: f"{each(v)} (mean {v.mean():.2f})"
+    )
+    markdown(cells.unstack("panel"))
+    if figure:
+        found = runs.rename("value").reset_index()
+        title = "Heads that keep learning while they act, by method"
+        two_panels(found, ["training", "unseen"], "score on {} physics", figure, title)
+
+
+def changes(folder: Path, figure: Path | None, reference: Path | None) -> None:
+    """Return after physics changed in the middle of an episode, and steps until recovery."""
+    table = pd.concat([pd.read_csv(path) for path in sorted(folder.glob("*.csv"))])
+    table["panel"] = np.where(table.over == 1, "a jump", "a drift")
+    table["change"] = [
+        ", ".join(
+            f"{name} {json.loads(before)[name]:g} → {value:g}"
+            for name, value in json.loads(after).items()
+        )
+        + (f" in {over} steps" if over > 1 else "")
+        for before, after, over in zip(table.before, table.after, table.over, strict=True)
+    ]
+    cells = table.groupby(["method", "arm", "change"], sort=False).apply(
+        lambda rows: f"{rows.return_after.mean():.0f} ({rows.recovery_steps.median():.0f})"
+    )
+    markdown(cells.unstack("change"))
+    if figure:
+        keys = ["method", "arm", "panel", "run"]
+        found = table.groupby(keys, sort=False).return_after.mean().rename("value").reset_index()
+        title = "Physics that change while acting"
+        two_panels(found, ["a drift", "a jump"], "return after {}", figure, title)
+
+
+def planners(path: Path, figure: Path | None, reference: Path | None) -> None:
+    """Score of planners, or return where no score is known, against their FLOP per step."""
+    table = pd.read_csv(path)
+    value = "return_mean" if table.score.isna().any() else "score"
+    keys = ["planner", "physics"]
+    means = table.groupby(keys, sort=False)[["flop_per_step", "seconds_per_step", value]].mean()
+    cells = means.apply(
+        lambda row: f"{row.iloc[0] / 1e9:.3g}, {1e3 * row.iloc[1]:.3g}, {row.iloc[2]:.2f}", axis=1
+    )
+    print(f"GFLOP, ms per step, {value}")
+    markdown(cells.unstack("physics"))
+    if figure is None:
+        return
+    by_cost = means.groupby("planner").flop_per_step.mean().sort_values(kind="stable").index
+    numbers = {name: number for number, name in enumerate(by_cost, start=1)}
+    caption = (
+        f"Means over {table.run.nunique()} runs of {path.stem}. Line: planners that no cheaper one"
+        " equals. FLOP: matrix products of the imagined rollouts that were evaluated."
+    )
+    title = f"{value.partition('_')[0].capitalize()} against planning cost"
+    with figures.figure(figure, title=title, caption=caption, size=(11.0, 4.6)) as drawing:
+        kinds = list(table.physics.unique())
+        *panels, key = drawing.subplots(1, len(kinds) + 1, width_ratios=[4] * len(kinds) + [2.2])
+        key.axis("off")
+        lines = [f"{number}  {name}" for name, number in numbers.items()]
+        key.text(0, 1, "\n".join(lines), va="top", fontsize=8, linespacing=1.5)
+        for axes, physics in zip(panels, kinds, strict=True):
+            found = means.xs(physics, level="physics").sort_values("flop_per_step")
+            x, y = found.flop_per_step / 1e9, found[value]
+            axes.step(x, y.cummax(), where="post", color=figures.FAINT, lw=1.0)
+            axes.plot(x, y, "o", color=figures.LABELS[0], ms=5)
+            for name in found.index:
+                axes.annotate(
+                    str(numbers[name]), (x[name], y[name]), (4, 3), textcoords="offset points"
+                )
+            axes.set_xscale("log")
+            axes.set_title(f"{physics} physics")
+            figures.numbers(axes, y=value.partition("_")[0])
+            axes.set_xlabel("GFLOP per step")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def ceilings(folder: Path, figure: Path | None, reference: Path | None) -> None:
+    """Mean and standard deviation of random actions and of the planner on the true dynamics."""
+    for random in sorted(folder.glob("*-random.csv")):
+        tables = [pd.read_csv(random), pd.read_csv(str(random).replace("random", "true-dynamics"))]
+        found = pd.concat(tables).groupby(["sim_params", "method"])["return"]
+        print(f"\n{random.name.removesuffix('-random.csv')}, {found.size().min()} episodes\n")
+        markdown(found.agg(lambda v: f"{v.mean():.1f} ± {v.std(ddof=0):.1f}").unstack("method"))
+
+
+def main() -> None:
+    """Print a table; draw a figure where a file is named."""
+    made = {f.__name__: f for f in (scores, returns, arms, changes, planners, ceilings)}
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("what", choices=made)
+    parser.add_argument("source", type=Path, help="folder or CSV file")
+    parser.add_argument("figure", type=Path, nargs="?", help="PNG file to write")
+    parser.add_argument("--same-episodes", type=Path, metavar="CEILINGS")
+    asked = parser.parse_args()
+    made[asked.what](asked.source, asked.figure, asked.same_episodes)
+
+
+if __name__ == "__main__":
+    main()
