@@ -50,7 +50,7 @@ constraints: ## Rewrite constraints.txt from fresh installs of the newest versio
 	@for python in $(CONSTRAINED_PYTHONS); do \
 		venv=$(VENV)-constraints/$$(basename $$python) && rm -rf $$venv && echo "$$python: installing" && \
 		$$python -m venv $$venv && $$venv/bin/python -m pip install -qq --upgrade pip && \
-		$$venv/bin/python -m pip install -qq . --group test --group bench --group lint --group docs && \
+		$$venv/bin/python -m pip install -qq '.[lab]' --group test --group bench --group lint --group docs && \
 		$$venv/bin/python -m pip freeze --all --exclude headway --exclude setuptools \
 			| LC_ALL=C sort > $$venv.txt || exit 1; \
 	done
@@ -74,7 +74,7 @@ $(VENV)/main.stamp: $(SPECS)
 		% sys.version_info[:2])'
 	@test -x $(BIN)/pip || { echo "Creating $(VENV)"; $(PYTHON) -m venv $(VENV); }
 	@echo "Installing headway into $(VENV)"
-	@$(INSTALL) --editable .
+	@$(INSTALL) --editable '.[lab]'
 	@touch $@
 
 # A pip of 2025 or newer, because only that knows dependency groups.

@@ -150,7 +150,7 @@ def test_the_page_in_a_browser(browser, made, scheme, width):
     page.set_default_timeout(120_000)
     errors = []
     page.on("console", lambda message: errors.append(message.text))
-    page.on("pageerror", errors.append)
+    page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("request", lambda request: errors.append(request.url))
     page.goto(made.as_uri())
     assert [error for error in errors if not error.startswith("data:")] == [made.as_uri()]

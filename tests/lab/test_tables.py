@@ -4,6 +4,8 @@ import csv
 import io
 import json
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -173,3 +175,16 @@ def test_physics_are_written_for_readers():
     assert varying(physics[:1]) == ["length", "mass"]
     assert axis_label(["length", "mass_scale"]) == "length (m), mass scale"
     assert full_label(physics[0], ["length"]) == "length 1.5 m"
+
+
+def test_a_missing_extra_is_one_clear_line():
+    code = (
+        "import importlib.util as u; find = u.find_spec;"
+        "u.find_spec = lambda name, *rest: None if name == 'pandas' else find(name, *rest);"
+        "from headway.cli import main; raise SystemExit(main(['list', 'envs']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "pandas not installed" in done.stderr
+    assert done.stderr.strip().endswith("pip install headway[lab].")
+    assert done.stderr.count("\n") == 1

@@ -24,7 +24,7 @@ RAW_COLUMNS = [
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """What the finished runs of a comparison measured."""
+    """Measurements of the finished runs of a comparison."""
 
     comparison: Comparison
     episodes: pd.DataFrame
@@ -34,7 +34,7 @@ class Found:
 
     @property
     def is_collected(self) -> bool:
-        """Whether returns while collecting are compared, not those of tests."""
+        """Returns while collecting are compared, not those of tests."""
         return self.comparison.experiment.measure == tables.COLLECTED
 
     @property

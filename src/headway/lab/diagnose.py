@@ -1,4 +1,4 @@
-"""How well a trained run selects heads and knows its own error, as tables and as plain values."""
+"""Head selection and calibration of a trained run, as tables and as plain values."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -30,14 +30,14 @@ from headway.training.selection import (
 
 @dataclasses.dataclass(frozen=True)
 class Diagnosis:
-    """How heads were selected in a run's test episodes."""
+    """Head selection in a run's test episodes."""
 
     path: Path
     """The run directory."""
     config: Config
     """All settings."""
     episodes: dict[str, list[EpisodeSelection]]
-    """What all heads predicted, by group and in the order of the episodes."""
+    """Predictions of all heads, by group and in the order of the episodes."""
 
     @property
     def window(self) -> int:

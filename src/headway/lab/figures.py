@@ -19,7 +19,6 @@ import pandas as pd
 from markupsafe import escape
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -61,19 +60,12 @@ _HEADS = {
 }
 LABELS, HEADS = tuple(_LABELS), tuple(_HEADS)
 MARKERS, DASHES = "osD^vPX*", ("-", "--", ":")
-_SCALE = matplotlib.colormaps["plasma"]
-_ORDERED = {
-    to_hex(_SCALE(0.08 + 0.72 * place)): to_hex(_SCALE(0.4 + 0.6 * place))
-    for place in np.linspace(0, 1, 12)
-}
-ORDERED = tuple(_ORDERED)
 THEME = {
     **{"ink": (INK, "#e7e7ea"), "faint": (FAINT, "#9c9ca6"), "rule": (RULE, "#33343b")},
     **{"axis": ("#9a9a9a", "#60616b"), "paper": ("#ffffff", "#17181c")},
     "ground": (GROUND, "#26272e"),
     **{f"s{i}": pair for i, pair in enumerate(_LABELS.items())},
     **{f"h{i}": pair for i, pair in enumerate(_HEADS.items())},
-    **{f"p{i}": pair for i, pair in enumerate(_ORDERED.items())},
 }
 """Variables of the page's style sheet: a colour in light and in dark."""
 
@@ -224,7 +216,7 @@ def look(index: int) -> dict[str, Any]:
 
 
 def are_methods(arms: Sequence[Any]) -> bool:
-    """Whether every arm is another method, and not a setting of one."""
+    """Tell whether every arm is another method, and not a setting of one."""
     return len({arm.method for arm in arms}) == len(arms)
 
 

@@ -1,4 +1,4 @@
-"""What there is to name on the command line, and the runs of a comparison, as tables."""
+"""Tables of all names that the command line takes, and the runs of a comparison."""
 
 from collections.abc import Mapping
 from typing import Any

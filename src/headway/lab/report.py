@@ -36,7 +36,7 @@ Block = dict[str, Any]
 
 @dataclasses.dataclass(frozen=True)
 class Page:
-    """What the chapters show."""
+    """Contents of all chapters."""
 
     found: tables.Runs
     looks: dict[str, dict[str, Any]]

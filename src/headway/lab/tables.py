@@ -64,7 +64,7 @@ class Runs:
     settings: Mapping[str, Mapping[str, Any]]
     """Settings by dotted name, by run."""
     notes: Sequence[tuple[str, str]]
-    """What a reader must know of a run: its path, one line."""
+    """Remarks on runs: path of the run, one line."""
 
     @property
     def finished(self) -> pd.Series:
