@@ -177,8 +177,17 @@ def panel(
         label: What is seen, for those who cannot see it.
         size: Width and height in inches: small enough to be read on a phone.
     """
-    small = {"font.size": 8.5, "axes.labelsize": 8.5, "xtick.labelsize": 8, "ytick.labelsize": 8}
-    inline = {"svg.fonttype": "none", "savefig.facecolor": "none", "svg.hashsalt": name}
+    small: dict[Any, Any] = {
+        "font.size": 8.5,
+        "axes.labelsize": 8.5,
+        "xtick.labelsize": 8,
+        "ytick.labelsize": 8,
+    }
+    inline: dict[Any, Any] = {
+        "svg.fonttype": "none",
+        "savefig.facecolor": "none",
+        "svg.hashsalt": name,
+    }
     with matplotlib.rc_context({**_STYLE, **small, **inline}):
         drawing = Figure(figsize=size, layout="constrained")
         draw(drawing.subplots())
@@ -351,7 +360,7 @@ def by_physics(
             continue
         axes.scatter(x + rng.uniform(-0.13, 0.13, len(x)), y, s=18, color=style["color"],
                      alpha=0.55, linewidths=0)  # fmt: skip
-        for place, mean in means.items():
+        for place, mean in zip(means.index.to_numpy(float), means, strict=True):
             axes.plot([place - 0.3, place + 0.3], [mean] * 2, color=style["color"], linewidth=2.6)
     names = varying(physics)
     axes.set_xlim(-0.5, len(physics) - 0.5)
@@ -403,7 +412,7 @@ def head_shares(axes: Axes, table: pd.DataFrame) -> None:
     )
     members = shares.index.get_level_values("member").unique()
     for (member, text), heads in shares.iterrows():  # type: ignore[misc]
-        left = 1.12 * members.get_loc(member)
+        left = 1.12 * list(members).index(member)
         row = physics.index(parse_sim_params(text))
         for head, share in heads.fillna(0.0).items():
             color = HEADS[int(str(head)) % len(HEADS)]

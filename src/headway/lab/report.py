@@ -278,7 +278,9 @@ def _curves(page: Page) -> Block:
                 for method, level in here.groupby("method").return_mean.mean().items():
                     style = {"color": figures.FAINT, "fontsize": 7, "ha": "right", "va": "bottom"}
                     axes.axhline(level, color=figures.FAINT, linewidth=1, linestyle=":")
-                    axes.text(0.995, level, method, transform=axes.get_yaxis_transform(), **style)
+                    axes.text(
+                        0.995, level, str(method), transform=axes.get_yaxis_transform(), **style
+                    )
 
             label = f"Return over environment steps on {env}, {group}"
             panels.append((group != COLLECTED, page.panel(group_label(str(group)), draw, label)))
@@ -318,7 +320,7 @@ def _physics(page: Page) -> Block:
                     group_label(group),
                     lambda axes, values=values: figures.dots(axes, values, shown, name),
                     f"{name} of each method on {env}, {group}",
-                    size=(3.5, max(2.9, 0.6 + 0.25 * len(shown))),
+                    size=(3.5, 0.85 + 0.25 * len(shown)),
                 )
             )
         return {"panels": panels}

@@ -142,8 +142,10 @@ def read_runs(paths: Iterable[str | Path]) -> Runs:
         return names.merge(tables, on="run")
 
     episodes = together("episodes")
-    names_of_tables = ("curves", "collected", "assignments", "errors")
-    made = Runs(runs, episodes, *map(together, names_of_tables), settings, notes)
+    made = Runs(
+        runs, episodes, together("curves"), together("collected"), together("assignments"),
+        together("errors"), settings, notes,
+    )  # fmt: skip
     episodes["score"] = _scores(made)
     return made
 
@@ -309,7 +311,7 @@ def _scores(found: Runs) -> list[float]:
     reference returns. References that planned in several ways are compared like methods.
     """
     variants = found.runs.groupby(["env", "method"])["label"].nunique()
-    single = {key for key, count in variants.items() if count == 1 and key[1] in REFERENCES}
+    single = {key for key in variants[variants == 1].index if key[1] in REFERENCES}
     found.runs["is_reference"] = [key in single for key in found.runs[["env", "method"]].itertuples(
         index=False, name=None)]  # fmt: skip
     if found.runs.is_reference.all():
@@ -375,7 +377,8 @@ def episode_table(rows: Sequence[EpisodeRow], config: Config) -> pd.DataFrame:
 def facts(table: pd.DataFrame) -> list[dict[str, Any]]:
     """Lines of `by_physics` or `by_group` as plain values, for JSON."""
     names = ["group", "sim_params", "episodes", "return_mean", "return_std", "score"]
-    lines = table[[name for name in names if name in table]].to_dict("records")
+    shown = table[[name for name in names if name in table]]
+    lines: list[dict[str, Any]] = shown.to_dict("records")  # type: ignore[assignment]
     for line in lines:
         line["score"] = None if np.isnan(line["score"]) else line["score"]
         if "sim_params" in line:
