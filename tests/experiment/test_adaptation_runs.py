@@ -24,9 +24,9 @@ def test_the_prior_of_a_loaded_agent_comes_from_all_its_data(two_iterations):
     run = RunDir(two_iterations)
     config = config_to_evaluate(run.config(), LAST_LAYER)
     agent = loading.load_agent(run, config)
-    assert agent.prior.ratio.shape == (agent.model.num_members,)
+    assert agent.model.prior.root.shape[0] == agent.model.net.num_members
     learned, task = loading.load_learned(run, config), loading.load_task(config)
     learner = loading.learner_of(config, task)
     part = learner.agent(learned, trajectories=run.load_data()[:1])
-    assert (part.prior.noise != agent.prior.noise).all()
-    assert loading.load_agent(run).prior is None
+    assert (part.model.prior.noise != agent.model.prior.noise).all()
+    assert loading.load_agent(run).model.prior is None

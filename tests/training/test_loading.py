@@ -30,7 +30,7 @@ def test_a_controller_can_go_on_learning(root):
     for _ in range(2):
         controller.act(OBS)
     assert controller.agent.prior is not None
-    assert np.abs(controller._state.learned.layer.weight).max() > 0
+    assert np.abs(controller._state.belief.last_layer.weight).max() > 0
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from headway.data import (
     history_action_moments,
     sim_params_row,
 )
+from headway.models.last_layer import Residuals
 from headway.models.networks import ContextEncoder, Dense, DenseHeads, GaussianNet, Normalizer
 from headway.task import Task
 
@@ -199,6 +200,36 @@ class MultiHeadDynamics(eqx.Module):
         if self.context_encoder is None:
             return None
         return self.context_encoder(flat_history(history, statistics))
+
+    def residuals(
+        self,
+        task: Task,
+        statistics: Statistics,
+        transition: tuple[
+            Float[Array, "env obs"], Float[Array, "env action"], Float[Array, "env obs"]
+        ],
+        context: Float[Array, "member env context"] | None,
+    ) -> Residuals:
+        """Compare one transition per environment with every head's prediction.
+
+        Args:
+            task: How observations enter and leave the model.
+            statistics: The normalisers in use.
+            transition: Observations, actions in [-1, 1], next observations.
+            context: The context vectors that the heads plan with.
+        """
+        obs, action, next_obs = transition
+        x = network_input(task, statistics, obs, action)
+        x = jnp.broadcast_to(x, (self.num_members, *x.shape))
+        head_input = self.forward_net.head_input(x, context)
+        mean, logvar = self.forward_net.predict(head_input)
+        residual = statistics.delta.normalize(task.target(obs, next_obs)) - mean
+        one = jnp.ones((*head_input.shape[:-1], 1))
+        return Residuals(
+            jnp.concatenate([head_input, one], axis=-1).transpose(1, 0, 2),
+            residual.transpose(2, 0, 1, 3),
+            None if logvar is None else logvar.transpose(2, 0, 1, 3),
+        )
 
 
 def flat_history(

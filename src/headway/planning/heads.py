@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from headway.config import PlannerConfig, Precision
 from headway.errors import ConfigError
+from headway.models import last_layer
 from headway.models.base import (
     Dynamics,
     Keys,
@@ -23,10 +24,9 @@ from headway.models.base import (
     over_rows,
     plan_layers,
 )
+from headway.models.last_layer import LastLayer, Prior
 from headway.models.multi_headed import MultiHeadDynamics, Statistics, network_input
 from headway.models.networks import PRECISIONS, Dense, DenseHeads, swish
-from headway.planning.last_layer.learning import Learned, learn
-from headway.planning.last_layer.regression import Prior
 from headway.task import Task
 
 ERROR_DRAWS = 20  # noise draws of the released code's sampled error
@@ -41,8 +41,8 @@ class MultiHeadBelief(NamedTuple):
     context: Context
     heads: Int[Array, "env member"]
     """The head that each member plans with; with `average`, the one that would be adaptive."""
-    learned: Learned
-    """What the heads learned in this episode."""
+    last_layer: LastLayer | None
+    """Corrections that the heads learned in this episode; None where they learn nothing."""
     sim_params: Float[Array, "env sim_param"] | None
     """The true simulator parameters, for a model that is told them."""
 
@@ -63,7 +63,7 @@ class MultiHeadModel(Model):
         if self.planner.adaptation != "none" and self.prior is None:
             raise ConfigError(
                 "planner.adaptation is 'last-layer', but the model has no prior; make it with"
-                " headway.planning.last_layer.prior.fit_prior, or set planner.adaptation to none."
+                " headway.models.last_layer_prior.fit_prior, or set planner.adaptation to none."
             )
 
     @property
@@ -84,12 +84,15 @@ class MultiHeadModel(Model):
         """See `Model.init_belief`."""
         slots = max(self.history_length, self.planner.selection_length)
         recent = RecentTransitions.empty(num_envs, slots, self.task)
+        layer = None
+        if self.prior is not None and self.planner.adaptation != "none":
+            layer = LastLayer.init(self.prior, num_envs, self.net.num_heads)
         like = eqx.filter_eval_shape(self.context, recent, sim_params)
         return MultiHeadBelief(
             recent,
             jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like),
             jnp.zeros((num_envs, self.net.num_members), jnp.int32),
-            Learned.nothing(self, num_envs),
+            layer,
             sim_params,
         )
 
@@ -99,9 +102,17 @@ class MultiHeadModel(Model):
         """See `Model.observe`: encode the past, learn from the transition, choose heads."""
         recent = belief.recent.push(transition)
         context = self.context(recent, belief.sim_params)
-        learned = learn(self, belief.learned, transition, context)
+        layer = belief.last_layer
+        if layer is not None and self.prior is not None:
+            layer = last_layer.observe(
+                layer,
+                self.prior,
+                self.net.residuals(self.task, self.statistics, transition[:3], context),
+                transition.happened,
+                self.planner.change_threshold,
+            )
         heads = self.choose_heads(recent, context, keys)
-        return MultiHeadBelief(recent, context, heads, learned, belief.sim_params)
+        return MultiHeadBelief(recent, context, heads, layer, belief.sim_params)
 
     def context(
         self, recent: RecentTransitions, sim_params: Float[Array, "env sim_param"] | None = None
@@ -142,8 +153,7 @@ class MultiHeadModel(Model):
         if self.planner.head_selection == "average":
             num_heads = self.net.num_heads
             heads = jnp.broadcast_to(jnp.arange(num_heads), (*belief.heads.shape, num_heads))
-        layer = belief.learned.layer
-        correction = None if layer is None else layer.weight
+        correction = None if belief.last_layer is None else belief.last_layer.weight
         return fold(self, heads, belief.context, precision=precision, correction=correction)
 
 

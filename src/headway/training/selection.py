@@ -19,7 +19,6 @@ from headway.data import Trajectory, sim_params_row
 from headway.models.base import Transition
 from headway.planning.agent import Agent
 from headway.planning.heads import MultiHeadBelief, MultiHeadModel
-from headway.planning.last_layer.regression import Seen, foresee
 
 LEVELS = (0.5, 0.9, 0.95)  # central intervals that are counted
 
@@ -160,11 +159,11 @@ def _predict(
     def step(belief: MultiHeadBelief, now):
         time, obs, action, next_obs = jax.tree.map(lambda x: x[None], now)
         transition = Transition(obs, action, next_obs, jnp.ones(1, bool))
-        args = model.net, model.task, model.statistics, transition[:3], belief.context
-        seen, heads = Seen.through(*args), belief.heads
+        args = model.task, model.statistics, transition[:3], belief.context
+        seen, heads = model.net.residuals(*args), belief.heads
         difference = seen.residual[0]
-        if belief.learned.layer is not None:
-            difference = difference - foresee(belief.learned.layer, seen.features)[0]
+        if belief.last_layer is not None:
+            difference = difference - belief.last_layer.correction(seen.features)[0]
         deviation = None
         if seen.logvar is not None:
             scaled = difference * jnp.exp(-0.5 * seen.logvar[0])

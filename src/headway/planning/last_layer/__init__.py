@@ -1,1 +1,0 @@
-"""Heads that keep learning while they act: a Bayesian last layer for every episode."""
