@@ -1,11 +1,12 @@
-"""What every optimizer must keep to, and how well each searches a problem with a known answer."""
+"""Optimizers: what all keep to, each against a NumPy twin, and how well they search."""
+
+import dataclasses
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from search_helpers import ACTIONS, HORIZON, KEY, NUM_ENVS, begin, search, start, towards, watch
 
 from headway.config import (
     CEMConfig,
@@ -15,14 +16,19 @@ from headway.config import (
     RandomShootingConfig,
 )
 from headway.planning.optimizers import CEM, ICEM, MPPI, RandomShooting, make_optimizer
+from headway.planning.optimizers.base import colored_noise
+from headway.planning.optimizers.mppi import softmax_weights
 
-ROUNDS = 3
+NUM_ENVS, HORIZON, ACTIONS, ROUNDS = 2, 4, 2, 3
+KEY = jax.random.key(0)
+AIMS = [0.9, -0.2]
 OPTIMIZERS = [
-    CEM(num_candidates=40, num_elites=8, num_iterations=ROUNDS),
-    ICEM(num_candidates=40, num_elites=8, num_iterations=ROUNDS),
-    MPPI(num_candidates=40, num_iterations=ROUNDS),
-    RandomShooting(num_candidates=40, num_iterations=ROUNDS),
+    CEM(40, 8, ROUNDS, smoothing=0.2, initial_std=0.3),
+    ICEM(40, 8, ROUNDS, smoothing=0.2, initial_std=0.4),
+    MPPI(40, ROUNDS, initial_std=0.4, temperature=0.6),
+    RandomShooting(40, ROUNDS),
 ]
+SMALL_CEM, SMALL_ICEM, SMALL_MPPI, _ = OPTIMIZERS
 
 
 @pytest.fixture(params=OPTIMIZERS, ids=lambda optimizer: type(optimizer).__name__)
@@ -30,62 +36,108 @@ def optimizer(request):
     return request.param
 
 
-@eqx.filter_jit
-def push_outwards(optimizer, guess, key):
-    """Search for the largest action; the return is at most 1 if no candidate is beyond bounds."""
+def plan_of(value=0.0):
+    return jnp.full((NUM_ENVS, HORIZON, ACTIONS), value)
 
+
+def begin(optimizer, nominal=0.0):
+    """The optimizer's own start, but for the nominal plan."""
+    nominal = plan_of(nominal) if np.isscalar(nominal) else nominal
+    search = optimizer.init(*nominal.shape)
+    return search._replace(nominal=nominal, best=None if search.best is None else nominal)
+
+
+def towards(target):
+    """A score that is highest where every action equals the environment's target."""
+    aim = jnp.asarray(target)[:, None, None, None]
+    return lambda candidates, key: -jnp.square(candidates - aim).sum((-1, -2))
+
+
+@eqx.filter_jit
+def optimize(optimizer, target, start, bad, bad_envs, bad_if_positive, key):
+    def score(candidates, key):
+        spoiled = bad_envs[:, None] | (bad_if_positive & (candidates[..., 0, 0] > 0))
+        return jnp.where(spoiled, bad, towards(target)(candidates, key))
+
+    return optimizer.optimize(score, start, key=key)
+
+
+def search(optimizer, target, *, start=0.0, bad=0.0, bad_envs=(), bad_if_positive=False, key=0):
+    """Search for `target`; some candidates or all of some environments have a `bad` return."""
+    envs = jnp.asarray([env in bad_envs for env in range(NUM_ENVS)])
+    args = jnp.asarray(bad), envs, jnp.asarray(bad_if_positive), jax.random.key(key)
+    return optimize(optimizer, jnp.asarray(target), begin(optimizer, start), *args)
+
+
+def watch(optimizer, score, start, key=KEY):
+    """Search, and keep the candidates of every iteration, in float64."""
+    seen = []
+
+    def watched(candidates, key):
+        jax.debug.callback(lambda x: seen.append(np.float64(x)), candidates, ordered=True)
+        return score(candidates, key)
+
+    found = optimizer.optimize(watched, start, key=key)
+    jax.effects_barrier()
+    return found, seen
+
+
+# What all keep to.
+
+
+@pytest.mark.parametrize("start", [0.0, 0.97, -1.0])
+def test_plans_and_candidates_stay_within_bounds_and_shape(optimizer, start):
     def largest(candidates, key):
-        del key
-        assert candidates.shape[0] == NUM_ENVS
-        assert candidates.shape[2:] == (HORIZON, ACTIONS)
         return jnp.abs(candidates).max((-1, -2))
 
-    return optimizer.optimize(largest, begin(optimizer, guess), key=key)
-
-
-@pytest.mark.parametrize("guess", [0.0, 0.97, -1.0])
-def test_plans_and_candidates_stay_within_bounds_and_shape(optimizer, guess):
-    plan = push_outwards(optimizer, start(guess), KEY)
-    assert plan.actions.shape == (NUM_ENVS, HORIZON, ACTIONS)
-    assert plan.expected_return.shape == plan.failures.shape == (NUM_ENVS,)
-    assert np.abs(np.asarray(plan.actions)).max() <= 1.0
-    assert (np.asarray(plan.expected_return) <= 1.0).all()
-    np.testing.assert_array_equal(plan.failures, 0)
-
-
-def test_search_moves_towards_each_environments_own_optimum(optimizer):
-    means = np.asarray(search(optimizer, [0.6, -0.6]).actions).mean((1, 2))
-    assert means[0] > 0.2
-    assert means[1] < -0.2
+    found, seen = watch(optimizer, largest, begin(optimizer, start))
+    assert found.actions.shape == (NUM_ENVS, HORIZON, ACTIONS)
+    assert np.abs(found.actions).max() <= 1.0
+    for candidates in seen:
+        assert candidates.shape[0] == NUM_ENVS
+        assert candidates.shape[2:] == (HORIZON, ACTIONS)
+        assert np.abs(candidates).max() <= 1.0 + 1e-6
+    np.testing.assert_array_equal(found.evaluations, sum(x.shape[1] for x in seen))
+    assert optimizer.max_evaluations == sum(x.shape[1] for x in seen)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_a_non_finite_candidate_never_wins_nor_is_an_elite(optimizer, bad):
-    plan = search(optimizer, [0.9, 0.9], bad=bad, bad_if_positive=True)
-    assert (np.asarray(plan.actions)[:, 0, 0] <= 0).all()
-    assert np.isfinite(plan.expected_return).all()
-    np.testing.assert_array_equal(plan.failures, 0)
+def test_non_finite_returns_rank_last(optimizer, bad):
+    found = search(optimizer, [0.9, 0.9], bad=bad, bad_if_positive=True)
+    assert (np.asarray(found.actions)[:, 0, 0] <= 0).all()
+    assert np.isfinite(found.expected_return).all()
+    np.testing.assert_array_equal(found.non_finite, 0)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_when_nothing_is_finite_the_guess_is_kept_and_counted_in_that_environment_only(
-    optimizer, bad
-):
-    guess = start(0.25).at[:, 1].set(-0.5)
-    healthy = search(optimizer, [0.5, 0.5], guess=guess)
-    plan = search(optimizer, [0.5, 0.5], guess=guess, bad=bad, bad_envs=[0])
-    np.testing.assert_array_equal(plan.actions[0], guess[0])
-    np.testing.assert_array_equal(plan.failures, [ROUNDS, 0])
-    np.testing.assert_array_equal(plan.actions[1], healthy.actions[1])
-    assert not np.isfinite(plan.expected_return[0])
-    assert plan.expected_return[1] == healthy.expected_return[1]
+def test_where_nothing_is_finite_the_nominal_plan_is_kept_in_that_environment_only(optimizer, bad):
+    start = plan_of(0.25).at[:, 1].set(-0.5)
+    healthy = search(optimizer, [0.5, 0.5], start=start)
+    found = search(optimizer, [0.5, 0.5], start=start, bad=bad, bad_envs=[0])
+    np.testing.assert_array_equal(found.actions[0], start[0])
+    np.testing.assert_array_equal(found.non_finite, [ROUNDS, 0])
+    np.testing.assert_array_equal(found.actions[1], healthy.actions[1])
+    assert found.expected_return[0] == -np.inf
+    assert found.expected_return[1] == healthy.expected_return[1]
 
 
-def test_environments_do_not_see_each_other(optimizer):
+def test_an_iteration_without_finite_returns_changes_nothing_but_the_count(optimizer):
+    found, (candidates, *_) = watch(optimizer, towards(AIMS), begin(optimizer))
+    candidates = jnp.asarray(candidates, jnp.float32)
+    after = optimizer.tell(found, candidates, jnp.full(candidates.shape[:2], jnp.nan))
+    np.testing.assert_array_equal(after.actions, found.actions)
+    np.testing.assert_array_equal(after.nominal, found.nominal)
+    np.testing.assert_array_equal(after.elites, found.elites)
+    np.testing.assert_array_equal(after.non_finite, 1)
+
+
+def test_environments_draw_for_themselves_and_do_not_see_each_other(optimizer):
     first = search(optimizer, [0.5, -0.3])
-    second = search(optimizer, [-0.9, -0.3], guess=start().at[0].set(0.4))
+    second = search(optimizer, [-0.9, -0.3], start=plan_of().at[0].set(0.4))
     np.testing.assert_array_equal(first.actions[1], second.actions[1])
     assert (first.actions[0] != second.actions[0]).any()
+    alike = search(optimizer, [0.5, 0.5])
+    assert (alike.actions[0] != alike.actions[1]).any()
 
 
 def test_same_key_same_plan_and_another_key_another(optimizer):
@@ -94,28 +146,15 @@ def test_same_key_same_plan_and_another_key_another(optimizer):
     assert (plans[0] != plans[2]).any()
 
 
-def test_evaluations_are_what_was_really_scored(optimizer):
-    plan, seen = watch(optimizer, towards([0.3, -0.3]), begin(optimizer, start()))
-    sizes = [candidates.shape[1] for candidates in seen]
-    assert len(sizes) == ROUNDS
-    np.testing.assert_array_equal(plan.evaluations, sum(sizes))
-    assert optimizer.max_evaluations == sum(sizes)
-
-
-def test_a_first_state_starts_from_zero_and_shifting_moves_the_plan_on_by_one_step(optimizer):
-    first = optimizer.init(NUM_ENVS, HORIZON, ACTIONS)
-    np.testing.assert_array_equal(first.guess, start())
-    ended = search(optimizer, [0.6, -0.6]).state
+def test_a_shifted_search_starts_from_the_nominal_plan_one_step_later(optimizer):
+    ended, fresh = search(optimizer, [0.6, -0.6]), optimizer.init(NUM_ENVS, HORIZON, ACTIONS)
     later = optimizer.shift(ended)
-    np.testing.assert_array_equal(later.guess[:, :-1], ended.guess[:, 1:])
-    repeats = isinstance(optimizer, ICEM)
-    np.testing.assert_array_equal(later.guess[:, -1], ended.guess[:, -1] if repeats else 0.0)
-    assert jax.tree.map(jnp.shape, later) == jax.tree.map(jnp.shape, first)
-
-
-def test_environments_draw_different_candidates(optimizer):
-    plan = search(optimizer, [0.5, 0.5])
-    assert (plan.actions[0] != plan.actions[1]).any()
+    np.testing.assert_array_equal(later.nominal[:, :-1], ended.nominal[:, 1:])
+    last = ended.nominal[:, -1] if isinstance(optimizer, ICEM) else 0.0  # iCEM repeats it
+    np.testing.assert_array_equal(later.nominal[:, -1], last)
+    np.testing.assert_array_equal(later.actions, later.nominal)
+    for name in ("std", "expected_return", "evaluations", "non_finite"):
+        np.testing.assert_array_equal(getattr(later, name), getattr(fresh, name))
 
 
 def test_settings_reach_the_optimizer():
@@ -131,3 +170,199 @@ def test_settings_reach_the_optimizer():
     mppi = MPPIConfig(initial_std=0.4, noise_beta=1.5, temperature=0.7)
     assert made(mppi) == MPPI(9, 2, 0.4, 1.5, 0.7)
     assert made(RandomShootingConfig()) == RandomShooting(9, 2)
+
+
+# Each against a NumPy twin on `towards(AIMS)`; twins share only the random draws.
+
+
+def ask_keys(optimizer):
+    return [jax.random.split(key)[0] for key in jax.random.split(KEY, optimizer.num_iterations)]
+
+
+def numpy_returns(candidates):
+    return -((candidates - np.reshape(AIMS, (-1, 1, 1, 1))) ** 2).sum((-1, -2))
+
+
+def best_of(candidates, count):
+    order = np.argsort(-numpy_returns(candidates), axis=1)[:, :count]
+    return np.take_along_axis(candidates, order[:, :, None, None], axis=1)
+
+
+@pytest.mark.parametrize("start", [0.0, 0.5])
+def test_cem_equals_its_numpy_twin(start):
+    cem, mean = SMALL_CEM, np.float64(plan_of(start))
+    var = np.full(mean.shape, cem.initial_std**2)
+    found, seen = watch(cem, towards(AIMS), begin(cem, start))
+    for key, got in zip(ask_keys(cem), seen, strict=True):
+        shape = (NUM_ENVS, cem.num_candidates, HORIZON, ACTIONS)
+        draws = np.float64(jax.random.truncated_normal(key, -2.0, 2.0, shape))
+        room = np.minimum((mean + 1) / 2, (1 - mean) / 2)
+        candidates = mean[:, None] + np.minimum(room, np.sqrt(var))[:, None] * draws
+        np.testing.assert_allclose(got, candidates, atol=1e-5)
+        elites = best_of(candidates, cem.num_elites)
+        mean = cem.smoothing * mean + (1 - cem.smoothing) * elites.mean(1)
+        var = cem.smoothing * var + (1 - cem.smoothing) * elites.var(1)
+    np.testing.assert_allclose(found.actions, mean, atol=1e-5)
+    np.testing.assert_allclose(found.expected_return, numpy_returns(elites).mean(1), rtol=1e-4)
+
+
+@pytest.mark.parametrize("beta", [0.0, 2.0])
+def test_icem_equals_its_numpy_twin(beta):
+    icem = dataclasses.replace(SMALL_ICEM, noise_beta=beta)
+    earlier, _ = watch(icem, towards(AIMS), begin(icem, 0.1), jax.random.key(7))
+    start = icem.shift(earlier)
+    mean, std = np.float64(start.nominal), np.full(start.nominal.shape, icem.initial_std)
+    found, seen = watch(icem, towards(AIMS), start)
+    kept = np.float64(start.elites)
+    rounds = zip(icem.populations, ask_keys(icem), seen, strict=True)
+    for iteration, (size, key, got) in enumerate(rounds):
+        noise = colored_noise(key, (NUM_ENVS, size + icem.num_kept, HORIZON, ACTIONS), beta)
+        candidates = np.clip(mean[:, None] + std[:, None] * np.float64(noise), -1, 1)
+        candidates[:, size:] = np.where(np.isinf(kept), candidates[:, size:], kept)
+        if iteration == icem.num_iterations - 1:
+            candidates = np.concatenate([candidates, mean[:, None]], axis=1)
+        np.testing.assert_allclose(got, candidates, atol=1e-5)
+        elites = best_of(candidates, icem.num_elites)
+        mean = icem.smoothing * mean + (1 - icem.smoothing) * elites.mean(1)
+        std = icem.smoothing * std + (1 - icem.smoothing) * elites.std(1)
+        kept = elites[:, : icem.num_kept]
+    np.testing.assert_allclose(found.actions, elites[:, 0], atol=1e-5)
+    np.testing.assert_allclose(found.nominal, mean, atol=1e-5)
+
+
+@pytest.mark.parametrize("beta", [0.0, 2.0])
+def test_mppi_equals_its_numpy_twin(beta):
+    mppi, mean = dataclasses.replace(SMALL_MPPI, noise_beta=beta), np.float64(plan_of(0.1))
+    found, _ = watch(mppi, towards(AIMS), begin(mppi, 0.1))
+    for key in ask_keys(mppi):
+        shape = (NUM_ENVS, mppi.num_candidates, HORIZON, ACTIONS)
+        noise = np.float64(colored_noise(key, shape, beta))
+        candidates = np.clip(mean[:, None] + mppi.initial_std * noise, -1, 1)
+        returns = numpy_returns(candidates)
+        standard = (returns - returns.mean(1, keepdims=True)) / returns.std(1, keepdims=True)
+        weights = np.exp(standard / mppi.temperature)
+        weights /= weights.sum(1, keepdims=True)
+        mean = np.einsum("ec,ecta->eta", weights, candidates)
+    np.testing.assert_allclose(found.actions, mean, atol=1e-5)
+    np.testing.assert_allclose(found.expected_return, (weights * returns).sum(1), rtol=1e-4)
+
+
+def test_random_shooting_takes_the_best_candidate_of_all_rounds():
+    found, seen = watch(OPTIMIZERS[-1], towards(AIMS), begin(OPTIMIZERS[-1]))
+    best = best_of(np.concatenate(seen, axis=1), 1)[:, 0]
+    np.testing.assert_allclose(found.actions, best, atol=1e-6)
+
+
+# What is special about each.
+
+
+def only_one(candidates, key):
+    returns = jnp.where(jnp.arange(candidates.shape[1]) == 3, 1.0, jnp.nan)
+    return jnp.broadcast_to(returns, candidates.shape[:2])
+
+
+def test_with_fewer_finite_candidates_than_elites_only_the_finite_ones_count():
+    found = [
+        CEM(40, n, num_iterations=1).optimize(only_one, begin(CEM(40, n)), key=KEY) for n in (1, 8)
+    ]
+    np.testing.assert_allclose(found[0].actions, found[1].actions, atol=1e-7)
+    np.testing.assert_array_equal(found[1].expected_return, 1.0)
+    icem, seen = watch(SMALL_ICEM, only_one, begin(SMALL_ICEM))
+    np.testing.assert_array_equal(icem.elites[:, 0], seen[-1][:, 3])
+    assert np.isinf(icem.elites[:, 1]).all()
+
+
+def assert_drawn(actions):
+    """Each action has a draw of its own, some of them clipped to the bounds."""
+    inside = actions[np.abs(actions) < 1]
+    assert len(np.unique(inside)) == inside.size > actions.size / 2
+
+
+def test_the_best_elites_of_icem_compete_again_at_the_next_step():
+    found, seen = watch(SMALL_ICEM, towards(AIMS), begin(SMALL_ICEM))
+    assert_drawn(seen[0][:, SMALL_ICEM.populations[0] :])
+    ended = best_of(seen[-1], SMALL_ICEM.num_kept)
+    _, later = watch(SMALL_ICEM, towards(AIMS), SMALL_ICEM.shift(found), jax.random.key(1))
+    again = later[0][:, SMALL_ICEM.populations[0] :]
+    np.testing.assert_array_equal(again[..., :-1, :], ended[..., 1:, :])
+    assert_drawn(again[..., -1, :])
+
+
+def test_each_iteration_of_icem_draws_fewer_but_never_less_than_twice_the_elites():
+    icem = ICEM(num_candidates=100, num_elites=20, num_iterations=6, population_decay=1.5)
+    assert icem.populations == (100, 66, 44, 40, 40, 40)
+    none_kept = dataclasses.replace(SMALL_ICEM, kept_elite_fraction=0.0)
+    _, seen = watch(none_kept, towards(AIMS), begin(none_kept))
+    assert [candidates.shape[1] for candidates in seen] == [40, 32, 25 + 1]  # and the last mean
+
+
+def test_between_two_equal_peaks_the_plan_of_icem_is_at_one_and_the_mean_between():
+    def two_peaks(candidates, key):
+        return -jnp.square(jnp.abs(candidates) - 0.7).sum((-1, -2))
+
+    icem = ICEM(num_candidates=400, num_elites=40, num_iterations=1, noise_beta=0.0)
+    found = icem.optimize(two_peaks, icem.init(NUM_ENVS, 1, 1), key=KEY)
+    np.testing.assert_allclose(np.abs(found.actions), 0.7, atol=0.05)
+    np.testing.assert_allclose(found.nominal, 0.0, atol=0.25)
+
+
+def test_weights_of_mppi():
+    returns = jax.random.normal(jax.random.key(3), (2, 30))
+    weights = softmax_weights(returns, 0.5)
+    np.testing.assert_allclose(weights.sum(1), 1.0, rtol=1e-5)
+    np.testing.assert_allclose(softmax_weights(1e3 * returns - 50, 0.5), weights, rtol=1e-2)
+    some = jnp.asarray([[3.0, 1.0, 2.0, 0.0]])
+    np.testing.assert_allclose(softmax_weights(some, 1e-3), [[1, 0, 0, 0]], atol=1e-6)
+    np.testing.assert_allclose(softmax_weights(some, 1e6), [[0.25] * 4], atol=1e-5)
+    low = -jnp.inf
+    odd = jnp.asarray([[2.0, 2.0, low], [low, low, low], [low, 5.0, low], [1e30, -1e30, 0.0]])
+    found = softmax_weights(odd, 0.5)
+    np.testing.assert_allclose(found[:3], [[0.5, 0.5, 0], [0, 0, 0], [0, 1, 0]], atol=1e-6)
+    assert np.isfinite(found).all()
+
+
+# A linear-quadratic problem, whose best return is known: x' = x + 0.3 u under -x² - 0.1 u².
+
+
+@pytest.mark.parametrize(
+    ("optimizer", "gap"), [(CEM(200, 20, 8), 0.05), (MPPI(200, 8), 0.15)], ids=["CEM", "MPPI"]
+)
+def test_it_beats_random_shooting_with_as_many_candidates_and_nears_the_optimum(optimizer, gap):
+    x0, gain, cost, steps = np.float32([[0.5, -0.4], [-0.3, 0.1], [0.2, 0.4]]), 0.3, 0.1, 10
+
+    def score(candidates, key):
+        x = x0[:, None, None] + gain * jnp.cumsum(candidates, axis=-2)
+        return -(jnp.square(x) + cost * jnp.square(candidates)).sum((-1, -2))
+
+    lower = gain * np.tril(np.ones((steps, steps)))
+    best = np.linalg.solve(
+        lower.T @ lower + cost * np.eye(steps), -lower.T @ np.ones((steps, 1)) * x0.ravel()
+    )
+    best = jnp.asarray(best.reshape(steps, 3, 2).swapaxes(0, 1), jnp.float32)
+
+    @eqx.filter_jit
+    def achieved(optimizer, key):
+        found = optimizer.optimize(score, begin(optimizer, jnp.zeros((3, steps, 2))), key=key)
+        return score(jnp.stack([found.actions, best, 0.0 * best], axis=1), None)
+
+    for key in range(3):
+        found, optimum, idle = np.asarray(achieved(optimizer, jax.random.key(key))).T
+        drawn = np.asarray(achieved(RandomShooting(200, 8), jax.random.key(key)))[:, 0]
+        assert (found > drawn).all()
+        assert (found <= optimum + 1e-5).all()
+        assert ((optimum - found) < gap * (optimum - idle)).all()
+
+
+@pytest.mark.parametrize("beta", [0.0, 0.5, 2.0])
+def test_coloured_noise_has_the_spectrum_and_the_size_it_promises(beta):
+    noise = np.float64(colored_noise(KEY, (4000, 32, 2), beta))
+    power = (np.abs(np.fft.rfft(noise, axis=1)) ** 2).mean((0, 2))
+    frequency = np.arange(1, 16)  # neither the constant part nor the highest frequency
+    slope, _ = np.polyfit(np.log(frequency), np.log(power[1:16]), 1)
+    assert slope == pytest.approx(-beta, abs=0.05)
+    for horizon in (1, 7, 32):
+        noise = np.float64(colored_noise(KEY, (4000, horizon, 2), beta))
+        np.testing.assert_allclose(noise.mean(0), 0.0, atol=0.07)
+        np.testing.assert_allclose(noise.var(0), 1.0, atol=0.12)
+    assert abs(np.corrcoef(noise[:, 5, 0], noise[:, 5, 1])[0, 1]) < 0.06
+    assert abs(np.corrcoef(noise[:-1, 5, 0], noise[1:, 5, 0])[0, 1]) < 0.06

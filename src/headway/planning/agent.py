@@ -15,7 +15,7 @@ from headway.data import sim_params_row
 from headway.models.base import Model, Transition
 from headway.models.compilation import in_each_precision
 from headway.planning import cpu
-from headway.planning.optimizers import Optimizer, Plan, make_optimizer
+from headway.planning.optimizers import Optimizer, Search, make_optimizer
 from headway.planning.rollouts import candidate_returns
 from headway.task import Task
 
@@ -31,7 +31,7 @@ class AgentState(NamedTuple):
     acted: Bool[Array, " env"]
     """Where that action, taken at `obs`, led to what is observed next."""
     search: Any
-    """Where the last search ended, one step later (`SearchState`); None for a random agent."""
+    """Where the last search ended, one step later (`Search`); None for a random agent."""
     key: PRNGKeyArray
 
 
@@ -137,13 +137,13 @@ def observe(agent: Agent, state: AgentState, obs: Float[Array, "env obs"]) -> St
     return Step(belief, dynamics, obs, plan_key=keys[3], next_key=keys[0])
 
 
-def decide(agent: Agent, step: Step, plan: Plan) -> tuple[AgentState, Decision]:
+def decide(agent: Agent, step: Step, plan: Search) -> tuple[AgentState, Decision]:
     """Take a plan's first action; where its search ended, one step later, is the next start."""
     action, acted = plan.actions[:, 0], jnp.ones(len(step.obs), bool)
-    search = make_optimizer(agent.planner).shift(plan.state)
+    search = make_optimizer(agent.planner).shift(plan)
     state = AgentState(step.belief, step.obs, action, acted, search, step.next_key)
     heads = getattr(step.belief, "heads", None)
-    return state, Decision(action, heads, plan.failures, plan.evaluations)
+    return state, Decision(action, heads, plan.non_finite, plan.evaluations)
 
 
 def act(
@@ -175,7 +175,7 @@ def iterate(agent: Agent, step: Step, search: Any, iteration: int) -> Any:
     planner, optimizer = agent.planner, make_optimizer(agent.planner)
     shards = _shards(agent, len(step.obs))
     # Iterations of a kind are one program; which of them it is decides the key alone.
-    which = step.plan_key, np.int32(iteration), optimizer.kind(iteration)
+    which = step.plan_key, np.int32(iteration), iteration * optimizer.unrolled
     if agent.model.traceable and shards == 1:
         return _iterate[planner.precision](agent, step, search, *which)
     candidates, score_key = _ask[planner.precision](optimizer, search, *which)
@@ -208,7 +208,7 @@ def open_loop(planner: PlannerConfig, state: AgentState) -> AgentState:
     """
     search = make_optimizer(planner).shift(state.search)
     unseen = jnp.zeros_like(state.acted)
-    return state._replace(action=state.search.guess[:, 0], acted=unseen, search=search)
+    return state._replace(action=state.search.nominal[:, 0], acted=unseen, search=search)
 
 
 def _shards(agent: Agent, num_envs: int) -> int:
@@ -218,7 +218,7 @@ def _shards(agent: Agent, num_envs: int) -> int:
 
 
 def _begun(agent: Agent, state: AgentState, obs: Float[Array, "env obs"]) -> tuple[Step, Any]:
-    return observe(agent, state, obs), make_optimizer(agent.planner).begin(state.search)
+    return observe(agent, state, obs), state.search
 
 
 def _asked(
@@ -247,10 +247,6 @@ def _iterated(agent: Agent, step: Step, search: Any, *which: Any) -> Any:
     return optimizer.tell(search, candidates, returns)
 
 
-def _ended(agent: Agent, step: Step, search: Any) -> tuple[AgentState, Decision]:
-    return decide(agent, step, make_optimizer(agent.planner).end(search))
-
-
 _act, _begin, _iterate, _ask, _tell, _end, _score = map(
-    in_each_precision, (act, _begun, _iterated, _asked, _told, _ended, candidate_returns)
+    in_each_precision, (act, _begun, _iterated, _asked, _told, decide, candidate_returns)
 )

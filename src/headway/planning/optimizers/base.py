@@ -1,89 +1,91 @@
-"""What every optimizer keeps to: a score function in, a plan and a state for later out."""
+"""Base of all optimizers: a search under way, how it goes on, and tools that several share."""
 
 import abc
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 Score = Callable[
     [Float[Array, "env candidate horizon action"], PRNGKeyArray], Float[Array, "env candidate"]
 ]
+"""Returns of candidates, by a key; a non-finite one ranks last."""
 
 Tree = TypeVar("Tree")
 
 
-class SearchState(NamedTuple):
-    """What a search starts from, and what it hands on to the search of the next step.
+class Search(NamedTuple):
+    """A search under way; its plan may be taken after any iteration."""
 
-    Every optimizer fills what it uses; what is None takes no memory.
-    """
-
-    guess: Float[Array, "env horizon action"]
-    """Where to start, within [-1, 1]; also the answer if every return is non-finite."""
-    elites: Float[Array, "env elite horizon action"] | None = None
-    """Good sequences to try again; infinite where an action is unknown, to be drawn."""
-
-
-class Plan(NamedTuple):
-    """The result of a search."""
-
-    actions: Float[Array, "env horizon action"]
-    """The chosen sequence, within [-1, 1]."""
+    nominal: Float[Array, "env horizon action"]
+    """The nominal plan: what candidates are drawn around, and what the next step starts from."""
     expected_return: Float[Array, " env"]
-    """What the search expects of it, as its optimizer says; -inf where nothing was finite."""
-    failures: Int[Array, " env"]
-    """Iterations in which no candidate had a finite return; the old plan was kept then."""
+    """Return of the plan as its optimizer estimates it; -inf where nothing was finite."""
+    non_finite: Int[Array, " env"]
+    """Iterations in which no candidate had a finite return; they change nothing else."""
     evaluations: Int[Array, " env"]
-    """Candidates that were scored to find it."""
-    state: SearchState
-    """Where the search ended; shifted by one step, the next one starts there."""
+    """Candidates that were scored."""
+    std: Float[Array, "env horizon action"]
+    """Standard deviation of the candidates."""
+    elites: Float[Array, "env elite horizon action"]
+    """Good sequences to try again; infinite where an action is unknown, to be drawn."""
+    best: Float[Array, "env horizon action"] | None = None
+    """The plan, if it is not the nominal one."""
+
+    @property
+    def actions(self) -> Float[Array, "env horizon action"]:
+        """The plan, within [-1, 1]."""
+        return jnp.clip(self.nominal if self.best is None else self.best, -1.0, 1.0)
 
 
 class Optimizer(eqx.Module):
-    """Searches for the action sequence of the highest return, iteration by iteration.
+    """Searches for the action sequence of the highest return: ask for candidates, tell returns."""
 
-    A search under way is a pytree of the optimizer's own; its plan may be taken after any
-    iteration.
-    """
-
+    num_candidates: eqx.AbstractVar[int]
     num_iterations: eqx.AbstractVar[int]
+    initial_std: eqx.AbstractVar[float]
+    num_kept = 0
+    """Elites that compete once more."""
+    unrolled: ClassVar[bool] = False
+    """Whether iterations differ in shape, so that each is compiled by itself."""
 
     @property
-    @abc.abstractmethod
     def max_evaluations(self) -> int:
         """Candidates scored for one environment's plan; fewer where it is cut off."""
+        return self.num_candidates * self.num_iterations
 
-    def init(self, num_envs: int, horizon: int, action_size: int) -> SearchState:
-        """Know nothing yet: start from actions of zero."""
-        return SearchState(jnp.zeros((num_envs, horizon, action_size)))
-
-    @abc.abstractmethod
-    def begin(self, state: SearchState) -> Any:
-        """A search before its first iteration."""
+    def init(self, num_envs: int, horizon: int, action_size: int) -> Search:
+        """The start of a search that knows nothing: actions of zero."""
+        none = jnp.zeros(num_envs, jnp.int32)
+        nominal = jnp.zeros((num_envs, horizon, action_size))
+        std = jnp.full_like(nominal, self.initial_std)
+        elites = jnp.full((num_envs, self.num_kept, horizon, action_size), jnp.inf, nominal.dtype)
+        nothing = jnp.full(num_envs, -jnp.inf, nominal.dtype)
+        return Search(nominal, nothing, none, none, std, elites)
 
     @abc.abstractmethod
     def ask(
-        self, search: Any, key: PRNGKeyArray, iteration: int = 0
+        self, search: Search, key: PRNGKeyArray, iteration: int = 0
     ) -> Float[Array, "env candidate horizon action"]:
         """Draw the candidates of an iteration.
 
         Args:
             search: The search so far.
             key: Draws them.
-            iteration: Which iteration; only its `kind` matters.
+            iteration: Which iteration; only an optimizer that is `unrolled` looks at it.
         """
 
     @abc.abstractmethod
     def tell(
         self,
-        search: Any,
+        search: Search,
         candidates: Float[Array, "env candidate horizon action"],
         returns: Float[Array, "env candidate"],
-    ) -> Any:
+    ) -> Search:
         """Learn from the returns of candidates; a non-finite one ranks last.
 
         Args:
@@ -92,50 +94,35 @@ class Optimizer(eqx.Module):
             returns: Their returns.
         """
 
-    def iterate(self, score: Score, search: Any, key: PRNGKeyArray, iteration: int = 0) -> Any:
-        """Ask for candidates, score them, tell their returns.
-
-        Args:
-            score: Returns of candidates.
-            search: The search so far.
-            key: Draws the candidates, and is handed on to `score`.
-            iteration: Which iteration; only its `kind` matters.
-        """
-        ask_key, score_key = jax.random.split(key)
-        candidates = self.ask(search, ask_key, iteration)
-        return self.tell(search, candidates, score(candidates, score_key))
-
-    @abc.abstractmethod
-    def end(self, search: Any) -> Plan:
-        """The plan of a search as it is now."""
-
-    def kind(self, iteration: int) -> int:
-        """The first iteration that is compiled alike; by default all are."""
-        del iteration
-        return 0
-
-    def optimize(self, score: Score, state: SearchState, *, key: PRNGKeyArray) -> Plan:
+    def optimize(self, score: Score, search: Search, *, key: PRNGKeyArray) -> Search:
         """Search for the best action sequence of every environment.
 
         Args:
-            score: Returns of candidates; a non-finite one ranks last.
-            state: Where to start.
+            score: Returns of candidates.
+            search: Where to start.
             key: Draws the candidates, and is handed on to `score`.
         """
-        search, _ = jax.lax.scan(
-            lambda search, key: (self.iterate(score, search, key), None),
-            self.begin(state),
-            jax.random.split(key, self.num_iterations),
-        )
-        return self.end(search)
 
-    def shift(self, state: SearchState) -> SearchState:
-        """Move a state on by one step of time; the new last action is zero."""
-        return SearchState(shift_steps(state.guess))
+        def iterate(search, key, iteration=0):
+            ask_key, score_key = jax.random.split(key)
+            candidates = self.ask(search, ask_key, iteration)
+            return self.tell(search, candidates, score(candidates, score_key)), None
+
+        keys = jax.random.split(key, self.num_iterations)
+        if not self.unrolled:
+            return jax.lax.scan(iterate, search, keys)[0]
+        for iteration, iteration_key in enumerate(keys):
+            search, _ = iterate(search, iteration_key, iteration)
+        return search
+
+    def shift(self, search: Search) -> Search:
+        """The start of the search one step later, along the nominal plan; its last action is 0."""
+        nominal = shift_steps(jnp.clip(search.nominal, -1.0, 1.0), 0.0)
+        return self.init(*nominal.shape)._replace(nominal=nominal)
 
 
 def shift_steps(
-    values: Float[Array, "*batch horizon action"], last: float | Array = 0.0
+    values: Float[Array, "*batch horizon action"], last: float | Array
 ) -> Float[Array, "*batch horizon action"]:
     """Drop the first step and append `last`."""
     appended = jnp.broadcast_to(last, values[..., :1, :].shape)
@@ -144,8 +131,55 @@ def shift_steps(
 
 def where_env(condition: Bool[Array, " env"], chosen: Tree, other: Tree) -> Tree:
     """For each environment, the arrays of one tree or those of the other."""
+    return jax.tree.map(
+        lambda x, y: jnp.where(condition.reshape(-1, *[1] * (x.ndim - 1)), x, y), chosen, other
+    )
 
-    def pick(x, y):
-        return jnp.where(condition.reshape(-1, *[1] * (x.ndim - 1)), x, y)
 
-    return jax.tree.map(pick, chosen, other)
+def rank_non_finite_last(
+    returns: Float[Array, "env candidate"],
+) -> Float[Array, "env candidate"]:
+    """Turn every non-finite return into -inf, so that it ranks last."""
+    return jnp.where(jnp.isfinite(returns), returns, -jnp.inf)
+
+
+def best_candidates(
+    candidates: Float[Array, "env candidate horizon action"],
+    returns: Float[Array, "env candidate"],
+    count: int,
+) -> tuple[Float[Array, "env elite horizon action"], Float[Array, "env elite"]]:
+    """The candidates of the highest returns, and these returns, best first."""
+    elite_returns, elite = jax.lax.top_k(rank_non_finite_last(returns), count)
+    return jnp.take_along_axis(candidates, elite[:, :, None, None], axis=1), elite_returns
+
+
+def moments(
+    elites: Float[Array, "env elite horizon action"], counted: Bool[Array, "env elite"]
+) -> tuple[Float[Array, "env horizon action"], Float[Array, "env horizon action"]]:
+    """Mean and population variance over the counted elites."""
+    weight = counted[..., None, None] / jnp.maximum(counted.sum(-1), 1)[:, None, None, None]
+    mean = (weight * elites).sum(1)
+    return mean, (weight * jnp.square(elites - mean[:, None])).sum(1)
+
+
+def colored_noise(
+    key: PRNGKeyArray, shape: tuple[int, ...], beta: float
+) -> Float[Array, "*batch horizon action"]:
+    """Draw normal noise of unit variance whose power falls with frequency as f^-beta.
+
+    Each action has a noise of its own; the spectrum is that along the horizon (Timmer and König,
+    1995). The constant part, which would be infinite, counts as one period in the horizon.
+
+    Args:
+        key: Draws the noise.
+        shape: Any number of axes, then horizon and action.
+        beta: 0 gives white noise, 1 pink, 2 red; larger is smoother.
+    """
+    white, horizon = jax.random.normal(key, shape), shape[-2]
+    if beta == 0:
+        return white
+    # A matrix filters white noise: it scales each frequency by f^(-beta/2); all rows have norm 1.
+    amplitude = np.maximum(np.arange(horizon // 2 + 1), 1) ** (-beta / 2)
+    filtered = np.fft.irfft(amplitude[:, None] * np.fft.rfft(np.eye(horizon), axis=0), horizon, 0)
+    shaping = (filtered / np.linalg.norm(filtered[0])).astype(np.float32)
+    return jnp.einsum("ts,...sa->...ta", shaping, white)

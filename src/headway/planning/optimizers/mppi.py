@@ -1,14 +1,10 @@
 """Model predictive path integral control (MPPI)."""
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float
 
-from headway.planning.optimizers.base import Optimizer, Plan, SearchState
-from headway.planning.optimizers.noise import colored_noise
-from headway.planning.optimizers.ranking import rank_non_finite_last
+from headway.planning.optimizers.base import Optimizer, colored_noise, rank_non_finite_last
 
 
 class MPPI(Optimizer):
@@ -28,59 +24,27 @@ class MPPI(Optimizer):
     noise_beta: float = 2.0
     temperature: float = 0.5
 
-    @property
-    def max_evaluations(self) -> int:
-        """See `Optimizer.max_evaluations`."""
-        return self.num_candidates * self.num_iterations
-
-    def begin(self, state: SearchState) -> "_Search":
-        """See `Optimizer.begin`."""
-        none = jnp.zeros(len(state.guess), jnp.int32)
-        return _Search(state.guess, jnp.zeros(len(state.guess)), none, none)
-
-    def ask(
-        self, search: "_Search", key: PRNGKeyArray, iteration: int = 0
-    ) -> Float[Array, "env candidate horizon action"]:
+    def ask(self, search, key, iteration=0):
         """See `Optimizer.ask`."""
         del iteration  # all are alike
-        num_envs, *sequence_shape = search.mean.shape
-        shape = (num_envs, self.num_candidates, *sequence_shape)
+        mean = search.nominal
+        shape = len(mean), self.num_candidates, *mean.shape[1:]
         noise = colored_noise(key, shape, self.noise_beta)
-        return jnp.clip(search.mean[:, None] + self.initial_std * noise, -1.0, 1.0)
+        return jnp.clip(mean[:, None] + search.std[:, None] * noise, -1.0, 1.0)
 
-    def tell(
-        self,
-        search: "_Search",
-        candidates: Float[Array, "env candidate horizon action"],
-        returns: Float[Array, "env candidate"],
-    ) -> "_Search":
+    def tell(self, search, candidates, returns):
         """See `Optimizer.tell`."""
         returns = rank_non_finite_last(returns)
         weights = softmax_weights(returns, self.temperature)
         found = jnp.isfinite(returns).any(-1)
         average = (weights[..., None, None] * candidates).sum(1)
         expected = (weights * jnp.where(weights > 0, returns, 0.0)).sum(-1)
-        return _Search(
-            mean=jnp.where(found[:, None, None], average, search.mean),
-            expected=jnp.where(found, expected, -jnp.inf),
-            failures=search.failures + ~found,
+        return search._replace(
+            nominal=jnp.where(found[:, None, None], average, search.nominal),
+            expected_return=jnp.where(found, expected, -jnp.inf),
+            non_finite=search.non_finite + ~found,
             evaluations=search.evaluations + self.num_candidates,
         )
-
-    def end(self, search: "_Search") -> Plan:
-        """See `Optimizer.end`."""
-        actions = jnp.clip(search.mean, -1.0, 1.0)
-        ended = SearchState(actions)
-        return Plan(actions, search.expected, search.failures, search.evaluations, ended)
-
-
-class _Search(NamedTuple):
-    """A search under way."""
-
-    mean: Float[Array, "env horizon action"]
-    expected: Float[Array, " env"]
-    failures: Int[Array, " env"]
-    evaluations: Int[Array, " env"]
 
 
 def softmax_weights(
