@@ -17,8 +17,8 @@ import pytest
 import toys
 from headway.config import CEMConfig, ICEMConfig, MPPIConfig, PlannerConfig, RandomShootingConfig
 from headway.planning import cpu
+from headway.planning.controller import Controller
 from headway.planning.cpu import Shard, in_shards, joined, normal_block, threefry2x32
-from headway.planning.deadline import DeadlinePlanner
 from headway.planning.rollouts import candidate_returns
 
 TINY = PlannerConfig(
@@ -93,14 +93,11 @@ def test_shards_have_the_returns_of_the_whole(shards, noise, caches, monkeypatch
     assert len(np.unique(whole)) == whole.size
 
 
-def test_a_deadline_planner_shares_its_iterations(sharing, monkeypatch):
+def test_a_controller_with_a_deadline_shares_its_iterations(sharing, monkeypatch):
     agent = make_agent()
-    state = agent.init(1, key=jax.random.key(0))
-    outcome = DeadlinePlanner(agent, 1000.0).act(state, OBS[:1], started=0.0, at_least=3)
+    shared = Controller(agent, deadline_ms=1e7).act(OBS[0])
     monkeypatch.setattr(cpu, "LEAST_STEPS", np.inf)
-    _, whole = agent.act(state, OBS[:1])
-    assert outcome.complete
-    np.testing.assert_allclose(outcome.decision.action, whole.action, atol=1e-5)
+    np.testing.assert_allclose(shared, Controller(agent).act(OBS[0]), atol=1e-5)
 
 
 def test_number_of_shards(monkeypatch):

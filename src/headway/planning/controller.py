@@ -1,6 +1,7 @@
 """One robot's controller: observations in, actions out, in the environment's own units."""
 
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
 
@@ -11,17 +12,22 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from headway.config import PlannerConfig
-from headway.errors import ConfigError, PlanningError
-from headway.models.multi_headed import Statistics
-from headway.planning.agent import Agent, open_loop
-from headway.planning.checking import RangeCheck, in_bounds, not_finite, one_row
-from headway.planning.deadline import DeadlinePlanner
+from headway.errors import ConfigError, PlanningError, shown
+from headway.planning.agent import Agent, Decision, begin, end, iterate, open_loop
 from headway.task import env_action, scaled_action
+
+REMEMBERED = 32
+"""Calls whose durations are remembered."""
+CONSTANT = 0.01
+"""Distance from its only value in training that a feature may have, relative to it or to 1."""
+MARGIN = 0.1
+"""Distance from its bounds that an action which was measured may have, relative to theirs."""
+
+_open_loop: Callable[..., Any] = eqx.filter_jit(open_loop)
 
 
 class Status(NamedTuple):
-    """How an action was found."""
+    """The way in which an action was found."""
 
     outcome: Literal["planned", "deadline", "held"]
     """`planned`: the search ended. `deadline`: it was cut off, and the action is the best so far.
@@ -29,33 +35,21 @@ class Status(NamedTuple):
     reason: str
     """Why the search was cut off or failed; empty where it ended."""
     warnings: tuple[str, ...]
-    """What of the observation is unlike the training data."""
+    """Features of the observation that are unlike the training data."""
     iterations: int
     """Iterations of the planner."""
     seconds: float
     """From the call of `act` to the action."""
 
 
-class _Found(NamedTuple):
-    """What planning came to."""
-
-    action: Float[np.ndarray, " action"]
-    """In [-1, 1]."""
-    failures: int
-    """Iterations without any finite return."""
-    iterations: int
-    complete: bool
-    """Whether the search ended by itself."""
-
-
 class Controller:
     """Acts with a trained agent, one step at a time.
 
     An observation of the wrong shape is an error. One that is not finite is not: the robot must
-    go on, so the controller holds to its last plan, as it does where planning finds nothing
-    finite or no iteration fits the deadline. A plan lasts `planner.horizon` steps; a controller
-    that has none left raises. An observation unlike the training data is planned with, and
-    `status.warnings` says what is off.
+    go on, so the controller holds to its last plan (open loop), as it does where planning finds
+    nothing finite or no iteration fits the deadline. A plan lasts `planner.horizon` steps; a
+    controller that has none left raises. An observation unlike the training data is planned with,
+    and `status.warnings` says what is off.
 
     Args:
         agent: The trained agent.
@@ -68,9 +62,10 @@ class Controller:
             step took, with any pause of the system.
         max_deviations: Standard deviations from the mean of the training data at which a feature
             of an observation is reported; None does not look.
+        clock: Tells the seconds.
 
     Raises:
-        ConfigError: The deadline is not positive, or the agent cannot plan to a deadline.
+        ConfigError: The deadline is not positive, or the agent makes no plans.
     """
 
     def __init__(
@@ -80,16 +75,30 @@ class Controller:
         seed: int = 0,
         deadline_ms: float | None = None,
         max_deviations: float | None = 10.0,
+        clock: Callable[[], float] = time.perf_counter,
     ):
         self.agent = agent
-        self._seed, self._episode = seed, -1
-        self._range = self._deadline = None
-        statistics: Statistics | None = getattr(agent.model, "statistics", None)
-        if statistics is not None and max_deviations is not None:
-            self._range = RangeCheck(agent.task, statistics.features, max_deviations)
+        self._seed, self._clock, self._episode = seed, clock, -1
+        statistics = getattr(agent.model, "statistics", None)
+        self._features = (
+            None if max_deviations is None or statistics is None else statistics.features
+        )
+        self._max_deviations = max_deviations or 0.0
+        self._preprocess = eqx.filter_jit(agent.task.preprocess)
+        self._durations = {name: deque([0.0], REMEMBERED) for name in ("iterate", "end")}
+        self._seconds = None if deadline_ms is None else deadline_ms / 1000
         if deadline_ms is not None:
-            self._deadline = self._planner_to(deadline_ms)
-            self._rehearse(self._deadline)
+            if not 0 < deadline_ms < float("inf"):
+                raise ConfigError(
+                    f"deadline_ms is {deadline_ms}, allowed: milliseconds above 0, or None for"
+                    " none."
+                )
+            if agent.model is None:
+                raise ConfigError(
+                    f"deadline_ms is {deadline_ms:g}, but random makes no plan that could be cut"
+                    " off, allowed: None; or take a method that plans, such as tmcl or pets."
+                )
+            self._warm_up()
         self._episode = -1
         self.reset()
 
@@ -134,31 +143,43 @@ class Controller:
                 and was not.
             PlanningError: There is no new plan, and no earlier one is left.
         """
-        started = time.perf_counter()
-        entries = self._checked(obs)
+        started, task = self._clock(), self.agent.task
+        if self._state is None:
+            names = ", ".join(self.agent.sim_param_names)
+            raise ConfigError(
+                f"the controller was told no sim_params, allowed: a value for each of {names},"
+                ' which its model takes as input; call reset(sim_params=info["sim_params"]) first.'
+            )
+        row = _row("obs", obs, task.obs_size, "pass one observation as the environment returns it")
         if applied_action is not None:
             self._correct(applied_action)
-        problem = not_finite(entries)
-        if problem is not None:
-            return self._hold(f"{problem}; check the sensor", started)
-        warnings = self._range(entries) if self._range else ()
-        found = self._plan(entries, started)
-        done, reason = found.iterations, ""
+        finite = np.isfinite(row)
+        if not finite.all():
+            entry = int(np.argmin(finite))
+            reason = f"obs[{entry}] is {row[entry]}, allowed: finite numbers; check the sensor"
+            self._count_left(held=True, reason=reason)
+            action = self._hold()
+            self._status = Status("held", reason, (), 0, self._clock() - started)
+            return action
+        warnings = self._unlike_training(row)
+        decision, done = self._search(row, started)
+        scaled, heads, failures, _ = jax.device_get(decision)
+        self._heads = None if heads is None else heads[0]
+        reason, held = "", bool(failures[0] >= done)
         if done == 0:
             reason = "no iteration of the planner fits the deadline"
-        elif found.failures >= done:
+        elif held:
             reason = f"none of {done} iterations of the planner found a finite return"
-        elif not found.complete:
+        elif done < self._num_iterations:
             reason = f"time was up after {done} of {self._num_iterations} iterations"
-        failed = found.failures >= done
-        self._count(failed, reason)
-        outcome = "held" if failed else "planned" if found.complete else "deadline"
-        self._status = Status(outcome, reason, warnings, done, time.perf_counter() - started)
-        return env_action(self.agent.task, found.action)
+        self._count_left(held=held, reason=reason)
+        outcome = "held" if held else "deadline" if done < self._num_iterations else "planned"
+        self._status = Status(outcome, reason, warnings, done, self._clock() - started)
+        return env_action(task, scaled[0])
 
     @property
     def status(self) -> Status | None:
-        """How the last action was found; None before the first."""
+        """The way in which the last action was found; None before the first."""
         return self._status
 
     @property
@@ -173,100 +194,74 @@ class Controller:
         return self._heads
 
     @property
-    def _planner(self) -> PlannerConfig | None:
-        """Settings of the planner, of an agent that plans."""
-        return self.agent.planner if self.agent.model is not None else None
-
-    @property
     def _num_iterations(self) -> int:
-        return self._planner.num_iterations if self._planner else 1
+        return 1 if self.agent.model is None else self.agent.planner.num_iterations
 
-    def _planner_to(self, deadline_ms: float) -> DeadlinePlanner:
-        if not 0 < deadline_ms < float("inf"):
-            raise ConfigError(
-                f"deadline_ms is {deadline_ms}, allowed: milliseconds above 0, or None for none."
-            )
-        if self.agent.model is None:
-            raise ConfigError(
-                f"deadline_ms is {deadline_ms:g}, but random makes no plan that could be cut"
-                " off, allowed: None; or take a method that plans, such as tmcl or pets."
-            )
-        return DeadlinePlanner(self.agent, deadline_ms / 1000)
+    def _search(self, obs: Float[np.ndarray, " obs"], started: float) -> tuple[Decision, int]:
+        """Plan to the end, or iteration by iteration as long as there is time.
 
-    def _rehearse(self, planner: DeadlinePlanner) -> None:
+        Between two iterations the clock is read, and another one begins only if the slowest of
+        the last ones would still fit. So the answer is late only where a part takes longer than
+        it lately did, by that much.
+
+        Returns:
+            The decision, and the number of iterations that were made.
+        """
+        if self._seconds is None:
+            self._state, decision = self.agent.act(self._state, obs[None])
+            return decision, self._num_iterations
+        until, done = started + self._seconds, 0
+        at_least = 0 if self._left > 0 else 1  # without a plan there is nothing else to do
+        step, search = begin(self.agent, self._state, jnp.asarray(obs[None]))
+        while done < self._num_iterations:
+            slowest = sum(map(max, self._durations.values()))
+            if done >= at_least and self._clock() + slowest > until:
+                break
+            search = self._timed("iterate", iterate, step, search, done)
+            done += 1
+        if done == 0:  # one hiccup is not remembered for long
+            for durations in self._durations.values():
+                durations.remove(max(durations))
+                durations.extend([] if durations else [0.0])
+        self._state, decision = self._timed("end", end, step, search)
+        return decision, done
+
+    def _timed(self, name: str, part: Callable, *args: Any) -> Any:
+        started = self._clock()
+        found = jax.block_until_ready(part(self.agent, *args))
+        self._durations[name].append(self._clock() - started)
+        return found
+
+    def _warm_up(self) -> None:
         """Live through all that `act` can meet, so that everything is compiled and timed."""
         self.reset(dict.fromkeys(self.agent.sim_param_names, 1.0))
-        obs = np.zeros(self.agent.task.obs_size, np.float32)
-        soon, late = float("inf"), -float("inf")
-        for left, started in ((0, soon), (1, soon), (1, late), (0, late)):
-            if self._range:
-                self._range(obs)
-            self._left = left
-            self._plan(obs, started)
-        for action in (self.agent.task.action_low, np.full(self.agent.task.action_size, np.nan)):
+        task, obs = self.agent.task, np.zeros(self.agent.task.obs_size, np.float32)
+        self._unlike_training(obs)
+        in_time, late = float("inf"), -float("inf")
+        for self._left, started in ((0, in_time), (1, in_time), (1, late), (0, late)):
+            self._search(obs, started)
+        for action in (task.action_low, np.full(task.action_size, np.nan)):
             self._correct(action)
-        self._left = 1
-        self._hold("a rehearsal", soon)
-        planner.warm_up()
+        self._hold()
+        for _ in range(3):
+            for durations in self._durations.values():
+                durations.clear()  # the first times are those of compiling
+                durations.append(0.0)
+            self._search(obs, in_time)
 
-    def _plan(self, obs: Float[np.ndarray, " obs"], started: float) -> "_Found":
-        """Search for a plan, as long as there is time, and remember where that led."""
-        if self._deadline is None:
-            self._state, decision = self.agent.act(self._state, obs[None])
-            done, complete = self._num_iterations, True
-        else:
-            at_least = 0 if self._left > 0 else 1  # there is nothing else to do
-            self._state, decision, done, complete = self._deadline.act(
-                self._state, obs[None], started, at_least
-            )
-        action, heads, failures = jax.device_get(
-            (decision.action[0], decision.heads, decision.failures[0])
-        )
-        self._heads = None if heads is None else heads[0]
-        return _Found(action, int(failures), done, complete)
+    def _hold(self) -> Float[np.ndarray, " action"]:
+        """The next action of the last plan, without a look (open loop)."""
+        self._state = _open_loop(self.agent.planner, self._state)
+        return env_action(self.agent.task, jax.device_get(self._state.action)[0])
 
-    def _checked(self, obs: Any) -> np.ndarray:
-        """An observation of the right shape, of a controller that was told what it must be."""
-        if self._state is None:
-            names = ", ".join(self.agent.sim_param_names)
-            raise ConfigError(
-                f"the controller was told no sim_params, allowed: a value for each of {names},"
-                ' which its model takes as input; call reset(sim_params=info["sim_params"]) first.'
-            )
-        advice = "pass one observation as the environment returns it"
-        return one_row("obs", obs, self.agent.task.obs_size, advice)
-
-    def _correct(self, applied_action: Any) -> None:
-        """Let the last step be remembered with the action that was applied, if it is known."""
-        task = self.agent.task
-        advice = "pass one action in the environment's units, as `act` returns it"
-        action = one_row("applied_action", applied_action, task.action_size, advice)
-        if self._planner is None:  # an agent that remembers no actions
-            return
-        if np.isfinite(action).all():
-            in_bounds("applied_action", action, task)
-            scaled = jnp.asarray(scaled_action(task, action)[None])
-            self._state = self._state._replace(action=scaled)
-        else:
-            self._state = self._state._replace(acted=jnp.asarray(np.zeros(1, bool)))
-
-    def _hold(self, reason: str, started: float) -> Float[np.ndarray, " action"]:
-        """The next action of the last plan."""
-        self._count(True, reason)
-        planner: Any = self._planner  # there is a plan to hold to
-        self._state = _held(planner, self._state)
-        scaled = jax.device_get(self._state.action[0])
-        self._status = Status("held", reason, (), 0, time.perf_counter() - started)
-        return env_action(self.agent.task, scaled)
-
-    def _count(self, held: bool, reason: str) -> None:
-        """Count how much of a plan is left.
+    def _count_left(self, *, held: bool, reason: str) -> None:
+        """Count the steps of the plan that are left.
 
         Raises:
-            PlanningError: Nothing is.
+            PlanningError: The plan is to be held, and none is.
         """
         if not held:
-            self._left = self._planner.horizon - 1 if self._planner else 0
+            self._left = 0 if self.agent.model is None else self.agent.planner.horizon - 1
         elif self._left <= 0:
             raise PlanningError(
                 f"{reason}, and no earlier plan is left, allowed: to hold to a plan for at most"
@@ -275,5 +270,61 @@ class Controller:
         else:
             self._left -= 1
 
+    def _correct(self, applied_action: Any) -> None:
+        """Let the last step be remembered with the action that was applied, if it is known.
 
-_held: Callable[[Any, Any], Any] = eqx.filter_jit(open_loop)
+        Raises:
+            ConfigError: It has another shape, or lies outside of its bounds by more than `MARGIN`.
+        """
+        task = self.agent.task
+        advice = "pass one action in the environment's units, as `act` returns it"
+        action = _row("applied_action", applied_action, task.action_size, advice)
+        if not np.isfinite(action).all():
+            self._state = self._state._replace(acted=jnp.asarray(np.zeros(1, bool)))
+            return
+        low, high = np.asarray(task.action_low), np.asarray(task.action_high)
+        margin = MARGIN * (high - low)
+        outside = (action < low - margin) | (action > high + margin)
+        if outside.any():
+            i = int(np.argmax(outside))
+            raise ConfigError(
+                f"applied_action[{i}] is {action[i]:g}, allowed: from {low[i]:g} to {high[i]:g},"
+                f" and {margin[i]:g} beyond for what was measured; {advice}."
+            )
+        self._state = self._state._replace(action=jnp.asarray(scaled_action(task, action)[None]))
+
+    def _unlike_training(self, obs: Float[np.ndarray, " obs"]) -> tuple[str, ...]:
+        """Word the features that are off; empty where all are as in training.
+
+        Mean and spread are all that is kept of the training data. A feature is what
+        `Task.preprocess` makes of an observation, mostly an entry of it.
+        """
+        if self._features is None:
+            return ()
+        mean, std = np.asarray(self._features.mean), np.asarray(self._features.std)
+        off = np.abs(jax.device_get(self._preprocess(jnp.asarray(obs))) - mean)
+        constant = CONSTANT * np.maximum(np.abs(mean), 1.0)
+        allowed = np.where(std == 0, constant, self._max_deviations * std)
+        return tuple(
+            f"feature {i} is off by {off[i]:.3g} from {mean[i]:.3g}, its only value in training"
+            if std[i] == 0
+            else f"feature {i} is {off[i] / std[i]:.3g} standard deviations from its mean in"
+            f" training, allowed: {self._max_deviations:g}"
+            for i in np.flatnonzero(~(off <= allowed))
+        )
+
+
+def _row(name: str, given: Any, size: int, advice: str) -> Float[np.ndarray, " size"]:
+    """One row of float32.
+
+    Raises:
+        ConfigError: It has another shape, or is no numbers.
+    """
+    try:
+        with np.errstate(over="ignore"):  # what is too large becomes infinite
+            row = np.asarray(given).astype(np.float32)
+    except (TypeError, ValueError):
+        raise ConfigError(f"{name} is {shown(given)}, allowed: {size} numbers; {advice}.") from None
+    if row.shape != (size,):
+        raise ConfigError(f"{name} has shape {row.shape}, allowed: ({size},); {advice}.")
+    return row
