@@ -122,7 +122,7 @@ class MultiHeadedConfig(ModelConfig):
     """Source of the networks' knowledge of the hidden physics: `learned` is the context encoder's
     vector, `history` the encoder's input as it is, `sim-params` the true simulator parameters."""
     context_at: Literal["input", "last-hidden", "head"] = "head"
-    """Layer that the context joins: the networks' `input`, the `last-hidden` one, or each `head`."""
+    """Layer that the context joins: the `input`, the `last-hidden` one, or each `head`."""
     context_size: CountOrNone = 10
     """Width of a `learned` context; 0 builds no context encoder, and the networks see none."""
     context_hidden_sizes: Widths = (256, 128, 64)
