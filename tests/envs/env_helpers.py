@@ -1,18 +1,11 @@
-"""What the tests of the environments share."""
+"""Names, actions and physics that the tests of the environments share."""
 
 import numpy as np
 
 from headway import envs
 from headway.task import env_spec
 
-NAMES = (
-    "pendulum",
-    "cartpole-swingup",
-    "hopper",
-    "slim-humanoid",
-    "half-cheetah",
-    "crippled-ant",
-)
+NAMES = ("pendulum", "cartpole-swingup", "hopper", "slim-humanoid", "half-cheetah", "crippled-ant")
 ROBOTS = NAMES[2:]
 
 
@@ -20,15 +13,12 @@ def actions_of(name: str, style: str, steps: int, seed: int = 0) -> np.ndarray:
     """Sequences a planner might try: random, at the bounds, smooth, or at rest."""
     space = envs.make(name).action_space
     rng, size = np.random.default_rng(seed), space.shape[0]
-    if style == "random":
-        raw = rng.uniform(-1, 1, (steps, size))
-    elif style == "extreme":
-        raw = np.sign(rng.standard_normal((steps, size)))
-    elif style == "sine":
-        phase = rng.uniform(0, 2 * np.pi, size)
-        raw = np.sin(0.3 * np.arange(steps)[:, None] + phase)
-    else:
-        raw = np.zeros((steps, size))
+    raw = {
+        "random": rng.uniform(-1, 1, (steps, size)),
+        "extreme": np.sign(rng.standard_normal((steps, size))),
+        "sine": np.sin(0.3 * np.arange(steps)[:, None] + rng.uniform(0, 2 * np.pi, size)),
+        "rest": np.zeros((steps, size)),
+    }[style]
     return (space.low + 0.5 * (raw + 1) * (space.high - space.low)).astype(np.float32)
 
 

@@ -6,12 +6,13 @@ import pytest
 from env_helpers import NAMES, all_physics, distinct_physics
 from gymnasium.vector import AutoresetMode
 
-from headway import envs, task
+import misbehaving
+from headway import envs
 from headway.envs import ClassicVectorEnv, RobotVectorEnv, SequentialVectorEnv
 from headway.envs.classic import PendulumTask
-from headway.errors import BadEnvironmentError, ConfigError, UnknownNameError
+from headway.errors import BadEnvironmentError, BrokenEpisodeError, ConfigError, UnknownNameError
 from headway.sim_params import SimParamSets
-from headway.task import EnvSpec, env_spec, register
+from headway.task import EnvSpec, env_spec
 
 NUM = 5
 
@@ -33,23 +34,24 @@ def assert_same(left, right):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_equals_stepping_one_by_one(name):
-    """Over 210 steps, three episodes each, all kinds of physics and actions."""
+    """Over three episodes each, all kinds of physics and actions, and seeds as in Gymnasium."""
     together, apart = envs.make_vec(name, NUM, episode_length=75), sequential(name, length=75)
     options = {"sim_params": distinct_physics(name, NUM)}
     assert_same(together.reset(seed=11, options=options), apart.reset(seed=11, options=options))
     space = together.action_space
     space.seed(0)
-    ends = 0
     for step in range(210):
         actions = space.sample()
         if step % 3 == 0:
             actions = np.where(actions > 0, space.high, space.low)
-        left, right = together.step(actions), apart.step(actions)
-        assert_same(left, right)
-        ends += left[3].sum()
-    assert ends == 2 * NUM
+        left = together.step(actions)
+        assert_same(left, apart.step(actions))
+        assert left[3].all() == (step in (74, 150))
+    kept = left[0].copy()
+    together.step(actions)
+    np.testing.assert_array_equal(left[0], kept)  # returned arrays are the caller's
+    assert isinstance(together, RobotVectorEnv if name in NAMES[2:] else ClassicVectorEnv)
     together.close()
-    apart.close()
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -67,11 +69,9 @@ def test_reset_mask_resets_only_the_chosen(name):
             assert_same(before, apart.step(actions))
         mask = rng.random(NUM) < 0.5
         options = {"reset_mask": mask, "sim_params": {}}
-        after = together.reset(seed=None, options=options)
-        assert_same(after, apart.reset(seed=None, options=options))
+        after = together.reset(options=options)
+        assert_same(after, apart.reset(options=options))
         np.testing.assert_array_equal(after[0][~mask], before[0][~mask])
-        for key, values in after[1]["sim_params"].items():
-            np.testing.assert_array_equal(values[~mask], before[4]["sim_params"][key][~mask])
     together.close()
 
 
@@ -80,47 +80,25 @@ def test_early_endings_restart_only_their_own_environment():
     together = envs.make_vec("cartpole-swingup", NUM, options=options)
     apart = sequential("cartpole-swingup", **options)
     assert_same(together.reset(seed=0), apart.reset(seed=0))
-    terminated, at = np.zeros(NUM, int), set()
-    for step in range(250):
+    ends = []
+    for _ in range(250):
         actions = np.ones((NUM, 1), np.float32)
         left = together.step(actions)
         assert_same(left, apart.step(actions))
-        if terminated_now := tuple(np.flatnonzero(left[2])):
-            at.add((step, terminated_now))
-        terminated += left[2]
-    assert (terminated > 1).all()
-    assert len(at) > 2  # not all at the same time
+        ends.append(left[2])
+    assert (np.sum(ends, 0) > 1).all()
+    assert any(0 < row.sum() < NUM for row in ends)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_seeds_as_in_gymnasium(name):
-    vector = envs.make_vec(name, 3)
-    together, info = vector.reset(seed=40)
-    listed, _ = vector.reset(seed=[40, 41, 42])
-    np.testing.assert_array_equal(together, listed)
-    env = envs.make(name)
-    for i in range(3):
-        obs, single = env.reset(seed=40 + i)
-        np.testing.assert_array_equal(together[i], obs)
-        assert single["sim_params"] == {k: v[i] for k, v in info["sim_params"].items()}
-    vector.close()
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_spaces_and_kinds(name):
-    vector = envs.make_vec(name, 3, episode_length=4)
-    env = envs.make(name)
-    assert vector.single_observation_space == env.observation_space
-    assert vector.single_action_space == env.action_space
-    assert vector.num_envs == 3
-    obs, _ = vector.reset(seed=0)
-    assert obs in vector.observation_space
-    robots = RobotVectorEnv if name in NAMES[2:] else ClassicVectorEnv
-    assert isinstance(vector, robots)
-    kept = obs.copy()
-    vector.step(vector.action_space.sample())
-    np.testing.assert_array_equal(obs, kept)  # returned arrays are the caller's
-    vector.close()
+def test_finished_environments_stand_still_without_autoreset():
+    env = SequentialVectorEnv(
+        [lambda: misbehaving.Drift("end", at=2), misbehaving.Drift], autoreset_mode="Disabled"
+    )
+    env.reset(seed=0)
+    rows = [env.step(np.ones((2, 1), np.float32))[:4] for _ in range(4)]
+    assert [reward.tolist() for _, reward, *_ in rows] == [[1, 1], [1, 1], [0, 1], [0, 1]]
+    assert [ends[0] for *_, ends, _ in rows] == [False, True, True, True]
+    np.testing.assert_array_equal(rows[3][0][0], rows[1][0][0])
 
 
 def test_gymnasium_makes_the_same_vector_environment():
@@ -133,18 +111,12 @@ def test_gymnasium_makes_the_same_vector_environment():
     vector.close()
 
 
-def test_own_physics_sets():
+def test_own_physics_sets_and_a_single_value_for_all():
     sets = SimParamSets({"length": (2.0,), "mass": (3.0,)})
     vector = envs.make_vec("pendulum", 2, sim_params=sets)
-    _, info = vector.reset(seed=0)
-    np.testing.assert_array_equal(info["sim_params"]["length"], [2.0, 2.0])
-    np.testing.assert_array_equal(info["sim_params"]["mass"], [3.0, 3.0])
-
-
-def test_a_single_value_serves_all_environments():
-    vector = envs.make_vec("pendulum", 3)
-    _, info = vector.reset(seed=0, options={"sim_params": {"length": 1.5}})
-    np.testing.assert_array_equal(info["sim_params"]["length"], [1.5] * 3)
+    _, info = vector.reset(seed=0, options={"sim_params": {"mass": 1.5}})
+    assert info["sim_params"]["length"].tolist() == [2.0, 2.0]
+    assert info["sim_params"]["mass"].tolist() == [1.5, 1.5]
 
 
 @pytest.mark.parametrize(
@@ -154,6 +126,7 @@ def test_a_single_value_serves_all_environments():
         {"sim_params": {"length": np.ones(2)}},
         {"sim_params": {"length": np.array([1.0, np.nan, 1.0])}},
         {"sim_params": {"length": np.array(["a", "b", "c"])}},
+        {"sim_params": 3},
         {"reset_mask": np.ones(2, bool)},
         {"reset_mask": np.ones(3)},
         {"reset_masks": np.ones(3, bool)},
@@ -189,191 +162,125 @@ def test_bad_arguments_are_refused():
         SequentialVectorEnv([])
 
 
-def test_a_simulation_that_diverges_is_told(tmp_path, monkeypatch):
+def test_a_simulation_that_diverges_costs_its_own_episode_only(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log there
-    vector = envs.make_vec("half-cheetah", 3)
-    vector.reset(seed=0)
-    plain = envs.make_vec("half-cheetah", 3)
-    plain.reset(seed=0)
+    vector, plain = (envs.make_vec("half-cheetah", 17) for _ in range(2))  # more than processors
+    for one in (vector, plain):
+        one.reset(seed=0)
     state = vector.get_state(1)
     state[9:18] = 1e12
     vector.set_state(1, state)
     action = vector.action_space.sample()
     obs, reward, terminated, truncated, info = vector.step(action)
     assert info["broken"] == {1: "the simulation of half-cheetah diverged (BADQVEL)"}
-    assert (terminated.any(), truncated.tolist()) == (False, [False, True, False])
-    assert np.isnan(obs).all(1).tolist() == np.isnan(reward).tolist() == [False, True, False]
-    np.testing.assert_array_equal(obs[[0, 2]], plain.step(action)[0][[0, 2]])
+    assert not terminated.any()
+    for bad in (truncated, np.isnan(obs).all(1), np.isnan(reward)):
+        assert np.flatnonzero(bad).tolist() == [1]
+    np.testing.assert_array_equal(np.delete(obs, 1, 0), np.delete(plain.step(action)[0], 1, 0))
     obs, _, _, _, info = vector.step(action)  # the next episode begins
     assert "broken" not in info
     assert np.isfinite(obs).all()
-    assert np.isfinite(vector.step(action)[0]).all()
     vector.close()
     plain.close()
-
-
-def test_more_environments_than_processors():
-    vector = envs.make_vec("half-cheetah", 17)
-    vector.reset(seed=0)
-    assert np.isfinite(vector.step(vector.action_space.sample())[0]).all()
-    vector.close()
-
-
-class OwnEnv(gymnasium.Env):
-    """A user's environment: a number that drifts by the hidden parameter."""
-
-    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float64)
-    action_space = gymnasium.spaces.Box(-2, 2, (1,), np.float32)
-
-    def __init__(self, *, backwards=False):
-        self.sign = -1 if backwards else 1
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.drift = self.sign * (options or {}).get("sim_params", {}).get("drift", 0.0)
-        self.position = 0.0
-        return np.full(3, self.position), {}
-
-    def step(self, action):
-        self.position += self.drift
-        return np.full(3, self.position), float(action[0]), self.position > 3, False, {}
-
-
-@pytest.fixture
-def own_spec():
-    gymnasium.register("own/Drift-v0", OwnEnv)
-    sets = SimParamSets({"drift": (1.0, 2.0)}, {"far": {"drift": (5.0,)}})
-    spec = EnvSpec(
-        "drift",
-        "own/Drift-v0",
-        lambda backwards: PendulumTask(),
-        sets,
-        6,
-        {"drift": 1.0},
-        {"backwards": False},
-    )
-    register(spec)
-    yield spec
-    del gymnasium.registry["own/Drift-v0"], task._registered["drift"]
-
-
-def test_environments_of_ones_own(own_spec):
-    vector = envs.make_vec("drift", 3)
-    _, info = vector.reset(seed=0, options={"sim_params": {"drift": np.array([1.0, 2.0, 5.0])}})
-    np.testing.assert_array_equal(info["sim_params"]["drift"], [1, 2, 5])
-    actions = np.arange(3, dtype=np.float32)[:, None]
-    obs, rewards, terminated, truncated, info = vector.step(actions)
-    np.testing.assert_array_equal(obs[:, 0], [1, 2, 5])
-    np.testing.assert_array_equal(rewards, [0, 1, 2])
-    np.testing.assert_array_equal(terminated, [False, False, True])
-    assert not truncated.any()
-    obs, rewards, _, _, info = vector.step(actions)
-    np.testing.assert_array_equal(obs[:, 0], [2, 4, 0])  # the third started over
-    assert rewards[2] == 0
-    assert info["sim_params"]["drift"][2] in (1.0, 2.0)
-    drawn = {float(vector.reset(seed=s)[1]["sim_params"]["drift"][0]) for s in range(20)}
-    assert drawn == {1.0, 2.0}
-    first = vector.reset(seed=4)[1]["sim_params"]["drift"]
-    np.testing.assert_array_equal(vector.reset(seed=4)[1]["sim_params"]["drift"], first)
-
-
-def test_options_and_time_limit_of_ones_own(own_spec):
-    vector = envs.make_vec("drift", 2, options={"backwards": True}, episode_length=4)
-    vector.reset(seed=0)
-    cuts = [vector.step(np.zeros((2, 1), np.float32))[3].all() for _ in range(4)]
-    assert cuts == [False, False, False, True]
-    assert isinstance(envs.make("drift").unwrapped, OwnEnv)
-
-
-def test_own_physics_under_another_name_steps_as_fast():
-    """A spec of one's own for a built-in id keeps its vector environment."""
-    spec = env_spec("hopper")
-    register(
-        EnvSpec(
-            "moon-hopper",
-            spec.env_id,
-            spec.make_task,
-            SimParamSets({"mass_scale": (1 / 6,), "damping_scale": (1.0,)}),
-            50,
-            dict(spec.default_sim_params),
-            dict(spec.options),
-        )
-    )
-    try:
-        vector = envs.make_vec("moon-hopper", 2)
-        assert isinstance(vector, RobotVectorEnv)
-        assert vector.episode_length == 50
-        assert vector.reset(seed=0)[1]["sim_params"]["mass_scale"][0] == pytest.approx(1 / 6)
-        vector.close()
-    finally:
-        del task._registered["moon-hopper"]
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_physics_differ_between_neighbours(name):
     """From equal states under equal actions, every environment goes its own way."""
-    physics = distinct_physics(name, len(all_physics(name)))
     number = len(all_physics(name))
     vector = envs.make_vec(name, number)
-    start, _ = vector.reset(seed=[7] * number, options={"sim_params": physics})
+    options = {"sim_params": distinct_physics(name, number)}
+    start, _ = vector.reset(seed=[7] * number, options=options)
     np.testing.assert_array_equal(start, np.broadcast_to(start[0], start.shape))
-    vector.action_space.seed(0)
     for _ in range(10):
-        action = np.broadcast_to(vector.single_action_space.high, vector.action_space.shape)
-        obs = vector.step(action)[0]
+        obs = vector.step(vector.action_space.high)[0]
     gaps = np.abs(obs[:, None] - obs[None]).max(-1)[np.triu_indices(number, 1)]
     assert gaps.min() > 1e-6
     vector.close()
 
 
-class Brittle(gymnasium.Env):
-    """Ends after `steps` steps and must not be stepped again."""
-
-    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
-    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
-
-    def __init__(self, steps):
-        self.steps = steps
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.count = 0
-        return np.zeros(1, np.float32), {"sim_params": {}}
-
-    def step(self, action):
-        assert self.count < self.steps, "stepped after the end"
-        self.count += 1
-        return np.full(1, self.count, np.float32), 1.0, self.count == self.steps, False, {}
+gymnasium.register("own/Drift-v0", "misbehaving:Drift")
+SETS = SimParamSets({"drift": (1.0, 2.0)}, {"far": {"drift": (5.0,)}})
+DRIFT = EnvSpec("drift", "own/Drift-v0", PendulumTask, SETS, 6, {"drift": 1.0})
+MOON = EnvSpec(
+    "moon-hopper",
+    "headway/Hopper-v0",
+    env_spec("hopper").make_task,
+    SimParamSets({"mass_scale": (1 / 6,), "damping_scale": (1.0,)}),
+    50,
+    {"mass_scale": 1.0, "damping_scale": 1.0},
+    {"scale_inertia": False},
+)
 
 
-def test_finished_environments_stand_still_without_autoreset():
-    env = SequentialVectorEnv(
-        [lambda: Brittle(2), lambda: Brittle(4)], autoreset_mode=AutoresetMode.DISABLED
-    )
-    env.reset(seed=0)
-    rows = [env.step(np.zeros((2, 1), np.float32))[:4] for _ in range(4)]
-    assert [obs[:, 0].tolist() for obs, *_ in rows] == [[1, 1], [2, 2], [2, 3], [2, 4]]
-    assert [reward.tolist() for _, reward, *_ in rows] == [[1, 1], [1, 1], [0, 1], [0, 1]]
-    assert [ends.tolist() for *_, ends, _ in rows] == [
-        [False, False],
-        [True, False],
-        [True, False],
-        [True, True],
-    ]
-    env.reset(options={"reset_mask": np.array([True, False])})
-    assert env.step(np.zeros((2, 1), np.float32))[0][:, 0].tolist() == [1, 4]
+def test_environments_of_ones_own():
+    vector = envs.make_vec("test_vector:DRIFT", 3)
+    physics = np.array([1.0, 2.0, 5.0])
+    start, info = vector.reset(seed=0, options={"sim_params": {"drift": physics}})
+    np.testing.assert_array_equal(info["sim_params"]["drift"], physics)
+    actions = np.arange(3, dtype=np.float32)[:, None]
+    for step in range(6):
+        obs, rewards, terminated, truncated, _ = vector.step(actions)
+        np.testing.assert_array_equal(rewards, [0, 1, 2])
+        assert (terminated.any(), truncated.all()) == (False, step == 5)
+    assert np.abs(obs - start).min() > 0
+    info = vector.step(actions)[-1]  # the next episodes begin
+    drawn = {*info["sim_params"]["drift"]}
+    drawn |= {float(vector.reset(seed=s)[1]["sim_params"]["drift"][0]) for s in range(20)}
+    assert drawn == {1.0, 2.0}
+    first = vector.reset(seed=4)[1]["sim_params"]["drift"]
+    np.testing.assert_array_equal(vector.reset(seed=4)[1]["sim_params"]["drift"], first)
+    assert isinstance(envs.make("test_vector:DRIFT").unwrapped, misbehaving.Drift)
+
+
+def test_own_physics_under_another_name_steps_as_fast():
+    """A spec of one's own for a built-in id keeps its vector environment."""
+    vector = envs.make_vec("test_vector:MOON", 2, options={"scale_inertia": True})
+    assert isinstance(vector, RobotVectorEnv)
+    assert vector.episode_length == 50
+    assert vector.reset(seed=0)[1]["sim_params"]["mass_scale"][0] == pytest.approx(1 / 6)
+    vector.close()
 
 
 @pytest.mark.parametrize(
-    ("result", "says"),
+    ("how", "says"),
     [
-        ((np.zeros(2), 0.0, False, False, {}), r"obs of shape \(2,\), allowed: \(1,\)"),
-        ((np.zeros(1), None, False, False, {}), "reward None, allowed: a number"),
+        ("shrink", r"obs of shape \(2,\), allowed: \(3,\)"),
+        ("lose_the_reward", "reward None, allowed: a number"),
     ],
 )
-def test_misshapen_results_are_named(result, says, monkeypatch):
-    monkeypatch.setattr(Brittle, "step", lambda self, action: result)
-    env = SequentialVectorEnv([lambda: Brittle(2)])
+def test_misshapen_results_are_named(how, says):
+    env = SequentialVectorEnv([lambda: misbehaving.Drift(how, at=1)])
     env.reset(seed=0)
     with pytest.raises(BadEnvironmentError, match=says):
         env.step(np.zeros((1, 1), np.float32))
+
+
+def test_a_next_episode_that_cannot_begin_is_cut_and_tried_again():
+    class Falls(misbehaving.Drift):
+        def reset(self, **given):
+            if self.elapsed:
+                self.elapsed = 0
+                raise BrokenEpisodeError("it fell over")
+            return super().reset(**given)
+
+    vector = SequentialVectorEnv([Falls, misbehaving.Drift], episode_length=2)
+    vector.reset(seed=0)
+    ones = np.ones((2, 1), np.float32)
+    for _ in range(2):
+        vector.step(ones)
+    obs, reward, _, truncated, info = vector.step(ones)
+    assert info["broken"] == {0: "it fell over"}
+    assert np.isnan(obs).any(1).tolist() == [True, False]
+    assert np.isnan(reward).tolist() == truncated.tolist() == [True, False]
+    obs, reward, _, truncated, info = vector.step(ones)  # begins at last
+    assert "broken" not in info
+    assert np.isfinite(obs).all()
+    assert (reward.tolist(), truncated.tolist()) == ([0.0, 1.0], [False, False])
+
+
+@pytest.mark.parametrize("how", ["change_spaces", "change_actions"])
+def test_spaces_must_stay_as_they_are(how):
+    vector = SequentialVectorEnv([lambda: misbehaving.Drift(how, at=0), misbehaving.Drift])
+    with pytest.raises(BadEnvironmentError, match=r"space .*allowed: .* in every episode"):
+        vector.reset(seed=0)

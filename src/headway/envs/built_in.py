@@ -5,7 +5,6 @@
 
 import abc
 import functools
-import inspect
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -29,7 +28,7 @@ from headway.envs.vector import (
     SimParams,
 )
 from headway.envs.world import World
-from headway.errors import BrokenEpisodeError, ConfigError, unknown_name
+from headway.errors import BrokenEpisodeError, ConfigError
 from headway.sim_params import SimParamSets
 from headway.task import BUILT_IN, EnvSpec, env_spec
 
@@ -157,7 +156,8 @@ class ClassicVectorEnv(WorldVectorEnv):
         after = self.world.next_state(state, action, sim_params)
         self._state[active], self._action[active] = after, action
         terminated = self.world.terminated(after)
-        return Outcome(self.world.reward(state, action, after), terminated, np.zeros(len(active)))
+        reward = self.world.reward(state, action, after)
+        return reward, terminated, np.zeros(len(active), bool), {}
 
     def observe(self) -> np.ndarray:
         """Observe all states."""
@@ -221,9 +221,9 @@ class RobotVectorEnv(WorldVectorEnv):
         after = self.world.after_step(before, qpos, qvel)
         self.velocity[active] = after.velocity[active]
         reward = self.world.reward(before, actions, after)[active]
-        warnings = {int(i): self.world.warning(self.datas[i]) for i in active}
-        no, broken = np.zeros(len(active), bool), {i: why for i, why in warnings.items() if why}
-        return Outcome(reward, no, no, broken)
+        warnings = {i: self.world.warning(self.datas[i]) for i in active.tolist()}
+        never = np.zeros(len(active), bool)
+        return reward, never, never, {i: why for i, why in warnings.items() if why}
 
     def _robot_state(self) -> RobotState:
         qpos = np.array([data.qpos for data in self.datas])
@@ -401,8 +401,6 @@ def make(name: str, **kwargs: Any) -> gymnasium.Env:
     """
     spec = env_spec(name)
     if _built_in(spec) is not None:
-        known = [*spec.options, "sim_params", *inspect.signature(gymnasium.make).parameters]
-        _check_options(spec, kwargs, [*known, "render_mode"])
         kwargs.setdefault("disable_env_checker", True)
     return gymnasium.make(spec.env_id, **kwargs)
 
@@ -436,7 +434,6 @@ def make_vec(
     """
     spec = env_spec(name)
     given: dict[str, Any] = dict(options or {})
-    _check_options(spec, given, spec.options)
     sets = sim_params or spec.sim_params
     length = spec.episode_length if episode_length is None else episode_length
     shared: dict[str, Any] = {"autoreset_mode": autoreset_mode}
@@ -461,12 +458,6 @@ def make_vec(
 def _built_in(spec: EnvSpec) -> str | None:
     """Return the built-in environment that a spec is about, maybe with physics of its own."""
     return next((name for name in BUILT_IN if env_spec(name).env_id == spec.env_id), None)
-
-
-def _check_options(spec: EnvSpec, given: Mapping[str, Any], known: Any) -> None:
-    for name in given:
-        if name not in known:
-            raise unknown_name(f"{spec.name} option", name, spec.options)
 
 
 for _name in BUILT_IN:

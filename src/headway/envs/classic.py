@@ -15,6 +15,8 @@ from headway.envs.world import World
 from headway.sim_params import SimParamSets
 from headway.task import Action, Ends, EnvSpec, Obs, Reward, Task
 
+Physics = Mapping[str, Any]
+"""Simulator parameters, each a number or an array with the axes of the states."""
 TRACK_LIMIT = 2.4
 """Largest distance of the cart from the middle of the track (m)."""
 
@@ -30,9 +32,7 @@ class ClassicWorld(World):
         """Draw the state that an episode starts in."""
 
     @abc.abstractmethod
-    def next_state(
-        self, state: Any, action: Any, sim_params: Mapping[str, Any], xp: Any = np
-    ) -> Any:
+    def next_state(self, state: Any, action: Any, sim_params: Physics, xp: Any = np) -> Any:
         """Return the state [..., state] after a step, by `numpy` or by `jax.numpy`."""
 
     @abc.abstractmethod
@@ -48,9 +48,7 @@ class ClassicWorld(World):
         return np.zeros(next_state.shape[:-1], bool)
 
     @abc.abstractmethod
-    def draw_frame(
-        self, state: np.ndarray, action: np.ndarray, sim_params: Mapping[str, float]
-    ) -> np.ndarray:
+    def draw_frame(self, state: np.ndarray, action: np.ndarray, sim_params: Physics) -> np.ndarray:
         """Draw a state and the action that led to it."""
 
 
@@ -130,9 +128,7 @@ class CartPoleSwingUp(ClassicWorld):
         """Nearly at rest, hanging down."""
         return rng.normal([0.0, 0.0, np.pi, 0.0], 0.2)
 
-    def next_state(
-        self, state: Any, action: Any, sim_params: Mapping[str, Any], xp: Any = np
-    ) -> Any:
+    def next_state(self, state: Any, action: Any, sim_params: Physics, xp: Any = np) -> Any:
         """Advance positions with the old velocities."""
         scale = sim_params["mass_scale"]
         m, total = self.pole_mass * scale, (self.pole_mass + self.cart_mass) * scale
@@ -162,9 +158,7 @@ class CartPoleSwingUp(ClassicWorld):
         off_track = np.abs(self.observe(next_state)[..., 0]) > np.float32(TRACK_LIMIT)
         return off_track & self.task.terminate_off_track
 
-    def draw_frame(
-        self, state: np.ndarray, action: np.ndarray, sim_params: Mapping[str, float]
-    ) -> np.ndarray:
+    def draw_frame(self, state: np.ndarray, action: np.ndarray, sim_params: Physics) -> np.ndarray:
         """Draw cart, pole and the pushing force."""
         from headway.envs import rendering
 
@@ -251,9 +245,7 @@ class Pendulum(ClassicWorld):
         """Any angle, and a speed within ±1 rad/s."""
         return rng.uniform([-np.pi, -1.0], [np.pi, 1.0])
 
-    def next_state(
-        self, state: Any, action: Any, sim_params: Mapping[str, Any], xp: Any = np
-    ) -> Any:
+    def next_state(self, state: Any, action: Any, sim_params: Physics, xp: Any = np) -> Any:
         """Advance the angle with the new speed before that is clipped."""
         angle, spin = xp.moveaxis(state, -1, 0)
         mass, length = sim_params["mass"], sim_params["length"]
@@ -277,9 +269,7 @@ class Pendulum(ClassicWorld):
         torque = action[..., 0]
         return -(np.square(wrapped) + 0.1 * np.square(spin) + 0.001 * np.square(torque))
 
-    def draw_frame(
-        self, state: np.ndarray, action: np.ndarray, sim_params: Mapping[str, float]
-    ) -> np.ndarray:
+    def draw_frame(self, state: np.ndarray, action: np.ndarray, sim_params: Physics) -> np.ndarray:
         """Draw the rod at its true relative length, and the torque."""
         from headway.envs import rendering
 

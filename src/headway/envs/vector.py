@@ -13,8 +13,7 @@ import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -36,14 +35,8 @@ Schedule = Mapping[int, Mapping[str, float]]
 """New simulator parameters by the step before which they come into force; 0 is the first."""
 
 
-class Outcome(NamedTuple):
-    """Results of a step of some of the environments."""
-
-    reward: np.ndarray
-    terminated: np.ndarray
-    truncated: np.ndarray
-    broken: Mapping[int, str] = MappingProxyType({})
-    """Environments whose episode cannot go on, and why."""
+Outcome = tuple[np.ndarray, np.ndarray, np.ndarray, dict[int, str]]
+"""Reward, terminated and truncated of some environments; which episodes cannot go on, and why."""
 
 
 class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -121,15 +114,12 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         schedules = self._read_schedules(options.get("schedule"))
         mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
-            raise ConfigError(
-                f"reset_mask has shape {mask.shape} and dtype {mask.dtype}, allowed:"
-                f" {self.num_envs} booleans."
-            )
+            raise ConfigError(f"reset_mask is {mask}, allowed: {self.num_envs} booleans.")
         chosen = np.flatnonzero(mask)
         self._start(chosen, [None if one is None else int(one) for one in seed], requested)
         for i in chosen:
             self._schedules[i] = schedules[i]
-        return self._observe_sound(), self._info()
+        return self._result()
 
     def step(
         self, actions: np.ndarray
@@ -162,32 +152,30 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 self._note_sim_params(i, changed)
         active = np.setdiff1d(active, list(broken))
         if active.size:
-            outcome = self._advance(active, actions)
             self._elapsed[active] += 1
-            rewards[active], terminated[active], truncated[active] = outcome[:3]
-            broken |= outcome.broken
-            if self.episode_length is not None:
-                truncated[active] |= self._elapsed[active] >= self.episode_length
+            *stepped, failed = self._advance(active, actions)
+            rewards[active], terminated[active], truncated[active] = stepped
+            truncated[active] |= self._elapsed[active] >= (self.episode_length or np.inf)
+            broken |= failed
         rewards[list(broken)], truncated[list(broken)] = np.nan, True
         self._broken |= broken
         self._ends = np.stack([terminated, truncated])
-        return self._observe_sound(), rewards, terminated, truncated, self._info()
+        obs, info = self._result()
+        return obs, rewards, terminated, truncated, info
 
     @property
     def sim_params(self) -> dict[str, np.ndarray]:
         """The simulator parameters now in force, one value per environment."""
         return {name: values.copy() for name, values in self._sim_params.items()}
 
-    def _info(self) -> dict[str, Any]:
-        broken = {"broken": dict(self._broken)} if self._broken else {}
-        return {"sim_params": self.sim_params, **broken}
-
-    def _observe_sound(self) -> np.ndarray:
-        """All observations; nothing is known of where an episode broke."""
-        obs, broken = self.observe(), list(self._broken)
-        if broken and obs.dtype.kind == "f":
-            obs[broken] = np.nan
-        return obs
+    def _result(self) -> tuple[np.ndarray, dict[str, Any]]:
+        """Observations, NaN where an episode broke, and infos."""
+        obs, info = self.observe(), {"sim_params": self.sim_params}
+        if not self._broken:
+            return obs, info
+        if obs.dtype.kind == "f":
+            obs[list(self._broken)] = np.nan
+        return obs, info | {"broken": dict(self._broken)}
 
     def _start(
         self, chosen: np.ndarray, seeds: Sequence[int | None], requested: Sequence[SimParams]
@@ -224,26 +212,25 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _read_schedules(self, value: Any) -> list[dict[int, SimParams]]:
         """Check the schedules: one for all environments, or a sequence of one for each."""
-        each = (
-            [value or {}] * self.num_envs if value is None or isinstance(value, Mapping) else value
-        )
-        if (
-            not isinstance(each, Sequence)
-            or len(each) != self.num_envs
-            or not all(isinstance(one, Mapping) for one in each)
-        ):
+        given = value or {}
+        each = [given] * self.num_envs if isinstance(given, Mapping) else given
+        sequence = isinstance(each, Sequence) and len(each) == self.num_envs
+        if not sequence or not all(isinstance(one, Mapping) for one in each):
             raise ConfigError(
-                f"schedule is {value!r}, allowed: one mapping from steps to simulator parameters,"
-                f" {{100: {{'mass_scale': 2.0}}}}, or {self.num_envs}, one per environment."
+                f"schedule is {value!r}, allowed: one mapping, or {self.num_envs} of them, one per"
+                " environment."
             )
-        for step, sim_params in ((s, v) for one in each for s, v in one.items()):
-            if isinstance(step, bool) or not isinstance(step, int) or step < 0:
-                raise ConfigError(f"schedule has a step {step!r}, allowed: whole numbers from 0.")
-            if not isinstance(sim_params, Mapping):
-                raise ConfigError(
-                    f"schedule step {step} is {sim_params!r}, allowed: values by parameter name."
-                )
-        return [{s: self._check_sim_params(dict(v)) for s, v in one.items()} for one in each]
+        schedules: list[dict[int, SimParams]] = [{} for _ in each]
+        for checked, one in zip(schedules, each, strict=True):
+            for step, sim_params in one.items():
+                whole = isinstance(step, int) and not isinstance(step, bool) and step >= 0
+                if not whole or not isinstance(sim_params, Mapping):
+                    raise ConfigError(
+                        f"schedule has {step!r}: {sim_params!r}, allowed: whole numbers from 0, and"
+                        " values by parameter name, {100: {'mass_scale': 2.0}}."
+                    )
+                checked[step] = self._check_sim_params(dict(sim_params))
+        return schedules
 
     def _check_sim_params(self, values: dict[str, Any]) -> SimParams:
         return values
@@ -395,7 +382,7 @@ class SequentialVectorEnv(HeadwayVectorEnv):
                     f"an environment returned the reward {reward!r}, allowed: a number; correct"
                     " the environment."
                 ) from None
-        return Outcome(rewards, ends[0], ends[1], broken)
+        return rewards, ends[0], ends[1], broken
 
     def _check_spaces(self, spaces: tuple[gymnasium.Space, gymnasium.Space]) -> None:
         allowed = self.single_observation_space, self.single_action_space

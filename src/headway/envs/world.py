@@ -25,6 +25,7 @@ class World(abc.ABC):
         **options: Options of the Task.
 
     Raises:
+        UnknownNameError: An option is unknown.
         ConfigError: A parameter is unknown or a value not allowed.
     """
 
@@ -36,6 +37,9 @@ class World(abc.ABC):
     """Seconds between two observations."""
 
     def __init__(self, sim_params: SimParamSets | None = None, **options: bool):
+        for name in options:
+            if name not in self.spec.options:
+                raise unknown_name(f"{self.spec.name} option", name, self.spec.options)
         self.task: Any = self.spec.make_task(**options)  # options are its fields
         self.sim_params = sim_params or self.spec.sim_params
         for group in self.sim_params.group_names:
