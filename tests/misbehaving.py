@@ -11,7 +11,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 
-BOX = gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float64)
+from headway.errors import BrokenEpisodeError
 
 
 class Drift(gymnasium.Env):
@@ -24,7 +24,7 @@ class Drift(gymnasium.Env):
         drift: Only environments under this physics misbehave, if given.
     """
 
-    observation_space = BOX
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float64)
     action_space = gymnasium.spaces.Box(-2, 2, (1,), np.float32)
 
     def __init__(self, how="", at=3, mark="", drift=None):
@@ -45,9 +45,14 @@ class Drift(gymnasium.Env):
     def step(self, action):
         self.elapsed += 1
         self.position += self.drift * self.np_random.normal(size=3)
-        found = self.misbehave()
-        obs, reward = self.position.copy(), float(action[0])
-        return found or (obs, reward, self.elapsed >= 12, False, {})
+        result = {
+            "obs": self.position.copy(),
+            "reward": float(action[0]),
+            "terminated": self.elapsed >= 12,
+            "truncated": False,
+            "info": {},
+        }
+        return tuple((result | (self.misbehave() or {})).values())
 
     def misbehave(self):
         if not self.how or self.elapsed != self.at or self.only not in (None, self.drift):
@@ -86,25 +91,13 @@ class Drift(gymnasium.Env):
         raise OddError("odd")
 
     def give_up(self):
-        from headway.errors import BrokenEpisodeError
-
         raise BrokenEpisodeError("the robot fell apart")
 
     def end(self):
-        return self.position.copy(), 1.0, True, False, {}
+        return {"terminated": True}
 
     def cut(self):
-        return self.position.copy(), 1.0, False, True, {}
-
-    def shrink(self):
-        return self.position[:2], 1.0, False, False, {}
-
-    def swell(self):
-        """An answer that no pipe holds."""
-        return np.zeros(500_000), 1.0, False, False, {}
-
-    def speak(self):
-        return np.array(["a", "b", "c"]), 1.0, False, False, {}
+        return {"truncated": True}
 
     def lose_a_number(self):
         return np.array([0.0, np.nan, 0.0]), 1.0, False, False, {}
@@ -113,10 +106,22 @@ class Drift(gymnasium.Env):
         return self.position.copy(), np.inf, False, False, {}
 
     def count(self):
-        return np.array([1, 2, 3]), 1, False, False, {}
+        return {"obs": np.array([1, 2, 3]), "reward": 1}
+
+    def shrink(self):
+        return {"obs": self.position[:2]}
+
+    def speak(self):
+        return {"obs": np.array(["a", "b", "c"])}
+
+    def lose_the_obs(self):
+        return {"obs": np.full(3, np.nan)}
 
     def lose_the_reward(self):
-        return self.position.copy(), None, False, False, {}
+        return {"reward": None}
+
+    def pay_too_much(self):
+        return {"reward": np.inf}
 
     def change_spaces(self):
         self.observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float64)

@@ -241,6 +241,8 @@ def test_masses_of_the_models():
     assert load_model("half_cheetah.xml").body_mass.sum() == pytest.approx(14.0)
     assert load_model("ant.xml").body_mass.sum() == pytest.approx(0.9109, abs=1e-4)
     assert load_model("humanoid.xml").body_mass.sum() == pytest.approx(42.116, abs=1e-3)
+    control_steps = [envs.make(name).unwrapped.vector.world.time_step for name in ROBOTS]
+    assert control_steps == pytest.approx([0.008, 0.015, 0.05, 0.05])
 
 
 @pytest.mark.parametrize("xml", ["hopper.xml", "humanoid.xml", "half_cheetah.xml", "ant.xml"])
@@ -266,14 +268,3 @@ def test_loading_the_models_warns_of_nothing(capfd, tmp_path, monkeypatch):
     load_model("half_cheetah.xml")
     assert capfd.readouterr() == ("", "")
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("name", "skip"),
-    [("hopper", 4), ("slim-humanoid", 5), ("half-cheetah", 5), ("crippled-ant", 5)],
-)
-def test_control_step(name, skip):
-    world = envs.make(name).unwrapped.vector.world
-    steps = {"hopper": 0.002, "slim-humanoid": 0.003, "half-cheetah": 0.01, "crippled-ant": 0.01}
-    assert world.frame_skip == skip
-    assert world.nominal.opt.timestep == steps[name]

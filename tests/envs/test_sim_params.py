@@ -7,28 +7,20 @@ from headway.errors import ConfigError, UnknownNameError
 from headway.sim_params import SimParamSets
 
 SETS = SimParamSets(
-    {"mass": (1.0, 2.0), "length": (0.5,)},
-    {"low": {"mass": (0.1, 0.2), "length": (0.5, 0.6)}},
+    {"mass": (1.0, 2.0), "length": (0.5, 3.0)},
+    {"low": {"mass": (0.1, 0.2), "length": (0.5,)}},
 )
 
 
-def test_groups_are_all_combinations():
+def test_groups_are_all_combinations_and_samples_uniform():
     assert SETS.group_names == ("train", "low")
-    assert SETS.group("train") == [{"mass": 1.0, "length": 0.5}, {"mass": 2.0, "length": 0.5}]
-    assert len(SETS.group("low")) == 4
+    assert SETS.group("low") == [{"mass": 0.1, "length": 0.5}, {"mass": 0.2, "length": 0.5}]
     with pytest.raises(UnknownNameError, match="Did you mean 'low'"):
         SETS.group("lov")
-
-
-def test_sample_is_uniform_and_independent():
-    sets = SimParamSets({"a": (1.0, 2.0), "b": (3.0, 4.0)})
     rng = np.random.default_rng(0)
-    draws = [tuple(sets.sample(rng).values()) for _ in range(2000)]
-    for pair in ((1.0, 3.0), (1.0, 4.0), (2.0, 3.0), (2.0, 4.0)):
-        assert 0.2 < draws.count(pair) / 2000 < 0.3
-
-
-def test_json_round_trip():
+    draws = [SETS.sample(rng) for _ in range(2000)]
+    for physics in SETS.group("train"):
+        assert 0.2 < draws.count(physics) / 2000 < 0.3
     assert SimParamSets.from_dict(json.loads(json.dumps(SETS.to_dict()))) == SETS
 
 
@@ -40,7 +32,6 @@ def test_json_round_trip():
         {"train": {"mass": []}},
         {"train": {"mass": 1.0}},
         {"train": {"mass": [float("nan")]}},
-        {"train": {"mass": [float("inf")]}},
         {"train": {"mass": ["1"]}},
         {"train": {"mass": [True]}},
         {"train": {"mass": [1.0]}, "unsen": {}},
@@ -48,7 +39,6 @@ def test_json_round_trip():
         {"train": {"mass": [1.0]}, "unseen": {"train": {"mass": [1.0]}}},
         {"train": {"mass": [1.0]}, "unseen": {"low": {"mas": [1.0]}}},
         {"train": {"mass": [1.0], "l": [1.0]}, "unseen": {"low": {"mass": [1.0]}}},
-        {"train": 3},
         None,
     ],
 )
@@ -67,5 +57,3 @@ def test_a_part_of_a_grid_has_every_value_equally_often():
     assert len({tuple(physics.items()) for physics in found}) >= 8  # no diagonal
     assert found == sets.spread("train", 10)
     assert sets.spread("train", 30) == [*sets.group("train"), *sets.group("train")[:5]]
-    one = SimParamSets({"mass": (1.0, 2.0, 3.0, 4.0)}).spread("train", 2)
-    assert sorted(physics["mass"] for physics in one) == [1.0, 3.0]

@@ -1,5 +1,10 @@
 """The Task says in JAX what the environment does in NumPy."""
 
+import json
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +17,7 @@ from hypothesis.extra.numpy import arrays
 from headway import envs
 from headway.envs.classic import PendulumTask
 from headway.envs.locomotion import HalfCheetahTask, HopperTask, SlimHumanoidTask
-from headway.errors import ConfigError
+from headway.errors import ConfigError, UnknownNameError
 from headway.sim_params import SimParamSets
 from headway.task import EnvSpec, env_names, env_spec, register
 
@@ -45,21 +50,13 @@ def test_reward_is_what_the_environment_paid(name, style):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_reward_in_single_precision(name):
+def test_reward_in_single_precision_and_of_actions_beyond_their_bounds(name):
     env, task = envs.make(name), TASKS[name]
-    obs, action, paid = record(env, actions_of(name, "random", 100), seed=0)
+    actions = actions_of(name, "random", 100)
+    actions[-1] = 9.0
+    obs, action, paid = record(env, actions, seed=0)
     arrays = (jnp.asarray(x, jnp.float32) for x in (obs[:-1], action, obs[1:]))
     np.testing.assert_allclose(task.reward(*arrays), paid, rtol=1e-5, atol=2e-5)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_reward_of_actions_beyond_their_bounds(name):
-    env, task = envs.make(name), TASKS[name]
-    obs, _ = env.reset(seed=0)
-    action = np.full(task.action_size, 9.0)
-    next_obs, paid, *_ = env.step(action)
-    reward = task.reward(*(jnp.asarray(x, jnp.float32) for x in (obs, action, next_obs)))
-    np.testing.assert_allclose(reward, paid, rtol=1e-5, atol=2e-5)
 
 
 def test_termination_is_what_the_environment_said():
@@ -99,6 +96,9 @@ def test_sizes_and_action_units(name):
     task = TASKS[name]
     assert task.feature_size == task.preprocess(jnp.zeros(task.obs_size)).shape[-1]
     assert task.feature_size == (11 if name == "hopper" else task.obs_size)
+    obs, action = jnp.zeros((4, 3, task.obs_size)), jnp.zeros((4, 3, task.action_size))
+    for function in (task.reward, task.released_reward, task.terminated):
+        assert jax.eval_shape(function, obs, action, obs).shape == (4, 3)  # any leading axes
     ends = jnp.array([[-1.0], [0.0], [1.0]]) * jnp.ones(task.action_size)
     own = task.scale_action(ends)
     np.testing.assert_allclose(own[0], task.action_low)
@@ -152,15 +152,8 @@ def test_released_rewards():
         assert same[0] == same[1]
 
 
-def test_rewards_take_any_leading_axes():
-    for task in TASKS.values():
-        obs, action = jnp.zeros((4, 3, task.obs_size)), jnp.zeros((4, 3, task.action_size))
-        for function in (task.reward, task.released_reward, task.terminated):
-            assert jax.eval_shape(function, obs, action, obs).shape == (4, 3)
-
-
-def test_catalog_lists_the_six():
-    assert tuple(env_names())[:6] == NAMES or set(NAMES) <= set(env_names())
+def test_the_six():
+    assert tuple(env_names())[:6] == NAMES
     groups = {name: env_spec(name).sim_params.group_names[1:] for name in NAMES}
     assert groups.pop("crippled-ant") == ("leg-3",)
     assert all(names == ("low", "high") for names in groups.values())
@@ -169,15 +162,68 @@ def test_catalog_lists_the_six():
     assert lengths == [200, 500, 500, 1000, 1000, 1000]
 
 
-def test_register_refuses_what_contradicts_itself():
+def spec(name="own", length=10, **defaults):
     sets = SimParamSets({"mass": (1.0,)})
+    return EnvSpec(name, "own/Env-v0", PendulumTask, sets, length, defaults or {"mass": 1.0})
 
-    def spec(name="own", length=10, **defaults):
-        return EnvSpec(name, "own/Env-v0", PendulumTask, sets, length, defaults)
 
-    for name, length, defaults in (("own", 0, {"mass": 1.0}), ("own", 10, {"masses": 1.0})):
+OWN = spec()
+NO_SPEC = 3
+
+
+def test_specs_that_contradict_themselves_are_refused():
+    for contradicting in ({"length": 0}, {"masses": 1.0}, {"name": ""}):
         with pytest.raises(ConfigError):
-            spec(name, length, **defaults)
+            spec(**contradicting)
     with pytest.raises(ConfigError, match="taken"):
-        register(spec("hopper", mass=1.0))
-    assert "own" not in env_names()
+        register(spec("hopper"))
+
+
+@pytest.mark.parametrize("name", ["OWN", "spec"])
+def test_environments_of_a_module_are_named_as_asked_for(name):
+    found = env_spec(f"test_tasks:{name}")
+    assert (found.name, found.env_id) == (f"test_tasks:{name}", OWN.env_id)
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "says"),
+    [
+        ("no_module:cart", ConfigError, "'no_module' raised ModuleNotFoundError"),
+        (":cart", ConfigError, "module:name"),
+        ("test_tasks:OWM", UnknownNameError, "Did you mean 'OWN'"),
+        ("test_tasks:NO_SPEC", ConfigError, "is int, allowed: an EnvSpec"),
+    ],
+)
+def test_unknown_modules_and_names_are_one_clear_line(name, error, says):
+    with pytest.raises(error, match=says) as caught:
+        env_spec(name)
+    assert "\n" not in str(caught.value)
+
+
+PACKAGE = """
+import gymnasium
+import misbehaving
+from headway import EnvSpec, SimParamSets
+from headway.envs.classic import PendulumTask
+
+gymnasium.register("own/Cart-v0", misbehaving.Drift)
+
+def cart():
+    sets = SimParamSets({"drift": (0.5, 1.0)})
+    return EnvSpec("cart", "own/Cart-v0", PendulumTask, sets, 5, {"drift": 0.5})
+"""
+
+
+def test_the_command_line_takes_environments_of_a_module_here(tmp_path):
+    (tmp_path / "my_package.py").write_text(PACKAGE)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    code = "import sys; from headway.cli import main; sys.exit(main())"  # as a console script
+    for words in (
+        "train my_package:cart --preset smoke --run-dir run",
+        "evaluate run --episodes 1",
+    ):
+        command = [sys.executable, "-P", "-c", code, *words.split()]
+        given = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
+        done = subprocess.run(command, check=False, **given)
+        assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["env"] == "my_package:cart"
