@@ -1,6 +1,5 @@
 """The Task says in JAX what the environment does in NumPy."""
 
-import json
 import os
 import subprocess
 import sys
@@ -226,7 +225,4 @@ def test_the_command_line_takes_environments_of_a_module_here(tmp_path):
         given = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
         done = subprocess.run(command, check=False, **given)
         assert done.returncode == 0, done.stderr
-    assert (
-        json.loads((tmp_path / "run" / "config.json").read_text())["settings"]["env"]
-        == "my_package:cart"
-    )
+    assert '"my_package:cart"' in (tmp_path / "run" / "config.json").read_text()

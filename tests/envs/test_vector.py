@@ -199,9 +199,9 @@ def test_physics_differ_between_neighbours(name):
     vector.close()
 
 
-gymnasium.register("own/Drift-v0", "misbehaving:Drift")
+gymnasium.register("own/VectorDrift-v0", "misbehaving:Drift")
 SETS = SimParamSets({"drift": (1.0, 2.0)}, {"far": {"drift": (5.0,)}})
-DRIFT = EnvSpec("drift", "own/Drift-v0", PendulumTask, SETS, 6, {"drift": 1.0})
+DRIFT = EnvSpec("drift", "own/VectorDrift-v0", PendulumTask, SETS, 6, {"drift": 1.0})
 MOON = EnvSpec(
     "moon-hopper",
     "headway/Hopper-v0",

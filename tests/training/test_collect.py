@@ -8,6 +8,7 @@ import pytest
 
 import misbehaving
 import runs
+from headway import task
 from headway.envs.classic import PendulumTask
 from headway.errors import BadEnvironmentError
 from headway.sim_params import SimParamSets
