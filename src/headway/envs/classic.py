@@ -69,7 +69,7 @@ class CartPoleSwingUpTask(Task):
     action_high: ClassVar[tuple[float, ...]] = (1.0,)
 
     terminate_off_track: bool = False
-    """Whether the episode ends when the cart is more than 2.4 m from the middle."""
+    """End the episode when the cart is more than 2.4 m from the middle."""
 
     def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """Height of the pole's tip after the step, scaled to [0, 1]."""

@@ -143,9 +143,9 @@ class HopperTask(Task):
     action_high: ClassVar[tuple[float, ...]] = (1.0,) * 3
 
     scale_inertia: bool = False
-    """Whether the mass scale applies to the rotational inertia too."""
+    """Apply the mass scale to the rotational inertia too."""
     observe_average_velocity: bool = True
-    """Whether the observation has the average forward velocity as its last entry."""
+    """Observe the average forward velocity as the last entry."""
 
     @property
     def obs_size(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -249,7 +249,7 @@ class SlimHumanoidTask(Task):
     action_high: ClassVar[tuple[float, ...]] = (0.4,) * 17
 
     scale_inertia: bool = False
-    """Whether the mass scale applies to the rotational inertia too."""
+    """Apply the mass scale to the rotational inertia too."""
 
     def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """Forward velocity before the step, effort, and a bonus for standing after it."""
@@ -334,7 +334,7 @@ class HalfCheetahTask(Task):
     action_high: ClassVar[tuple[float, ...]] = (1.0,) * 6
 
     scale_inertia: bool = False
-    """Whether the mass scale applies to the rotational inertia too."""
+    """Apply the mass scale to the rotational inertia too."""
 
     def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """Forward velocity over the step, and the effort."""
@@ -428,7 +428,7 @@ class CrippledAntTask(Task):
     action_high: ClassVar[tuple[float, ...]] = (1.0,) * 8
 
     shrink_leg: bool = False
-    """Whether the crippled leg is also half as long and thick."""
+    """Make the crippled leg half as long and thick, too."""
 
     def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """Forward velocity of the torso over the step, and a constant for being alive."""
