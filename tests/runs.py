@@ -4,9 +4,10 @@ import hashlib
 import json
 
 from headway.config import to_dict
+from headway.training.files import write_json
 from headway.training.methods import make_config
 from headway.training.progress import Progress
-from headway.training.run import SCHEMA, TABLES, RunDir, write_json
+from headway.training.run import SCHEMA, TABLES, RunDir
 
 TINY = {
     "collection.episode_length": 12,

@@ -72,7 +72,6 @@ def calls(monkeypatch, tmp_path):
 def trained(tmp_path):
     """A run directory as far as its settings go."""
     run_dir = RunDir(tmp_path / "trained")
-    run_dir.path.mkdir()
     run_dir.begin(make_config("pendulum", preset="quick"))
     return str(run_dir.path)
 

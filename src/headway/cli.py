@@ -316,7 +316,7 @@ class Record(_OfRun):
             schedule.setdefault(int(found[1]), {}).update(_physics([found[2]], "--schedule"))
         settings = self.changed(self.config())
         from headway.lab.record import record
-        from headway.training.run import check_target
+        from headway.training.files import check_target
 
         check_target(self.output)
         film = record(
@@ -381,7 +381,7 @@ class Report(Command):
     def run(self, words):
         """Write the page, and print where it is."""
         from headway.lab.report import write_report
-        from headway.training.run import check_target
+        from headway.training.files import check_target
 
         check_target(self.output)
         path = str(write_report(self.runs, self.output))
@@ -537,7 +537,7 @@ class PlotDynamics(Command):
             raise ConfigError(f"--num-states is {self.num_states}, allowed: at least 1.")
         from headway.lab import dynamics
         from headway.task import env_spec
-        from headway.training.run import check_target
+        from headway.training.files import check_target
 
         name = env_spec(self.env).name
         out = self.output or Path(f"{name}-dynamics.png")

@@ -73,7 +73,6 @@ def test_only_models_with_heads_are_diagnosed(tmp_path):
 
 @pytest.mark.parametrize("words", [[], ["--collected"]])
 def test_only_trained_runs_are_diagnosed(tmp_path, words, capsys):
-    (tmp_path / "run").mkdir()
     RunDir(tmp_path / "run").begin(make_config("pendulum", preset="smoke"))
     assert main(["diagnose", str(tmp_path / "run"), "--quiet", *words]) == 1
     assert "has no finished iteration yet" in capsys.readouterr().err

@@ -14,7 +14,7 @@ from rich.table import Table
 from headway.lab import figures, tables
 from headway.lab.statistics import MIN_RUNS, caution, compare, estimate, unlike, verdict
 from headway.lab.sweep import NOTE, Cell, Comparison, Workers, run_jobs
-from headway.training.run import write_bytes, write_json
+from headway.training.files import write_bytes, write_json
 
 RAW_COLUMNS = [
     "experiment", "arm", "env", "method", "preset", "seed", "iteration", "timesteps", "group",

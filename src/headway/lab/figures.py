@@ -34,8 +34,9 @@ from headway.lab.tables import (
     value_label,
     varying,
 )
+from headway.training.files import write_bytes
 from headway.training.methods import METHODS
-from headway.training.run import parse_sim_params, write_bytes
+from headway.training.run import parse_sim_params
 
 INK, FAINT, RULE, GROUND = "#222222", "#7a7a7a", "#e4e4e4", "#f4f4f4"
 _LABELS = {

@@ -22,8 +22,8 @@ import headway
 from headway.errors import ConfigError
 from headway.lab import figures, statistics, tables
 from headway.lab.tables import COLLECTED, PHASES, TRAIN, group_label
+from headway.training.files import write_bytes
 from headway.training.methods import METHODS
-from headway.training.run import write_bytes
 
 RAW_COLUMNS = [
     "env", "label", "seed", "group", "sim_params", "episodes", "return_mean", "return_std",

@@ -20,7 +20,8 @@ from headway.errors import BadEnvironmentError, HeadwayError
 from headway.planning.agent import Agent
 from headway.sim_params import SimParamSets
 from headway.task import Task, env_action, env_options, env_spec, episode_length, sim_param_sets
-from headway.training.run import Arrays, trajectories_from, trajectory_arrays
+from headway.training.files import Arrays
+from headway.training.run import trajectories_from, trajectory_arrays
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Episode:
-    """What defines an episode before it is run: physics and seed."""
+    """Physics and seed, which define an episode before it is run."""
 
     sim_params: dict[str, float]
     seed: int
@@ -85,7 +86,7 @@ class Environments:
 
 
 class Choice(NamedTuple):
-    """What a policy chose for every environment of a batch."""
+    """A policy's choice for every environment of a batch."""
 
     action: Float[np.ndarray, "env action"]
     """The actions to take, in [-1, 1]."""
@@ -132,7 +133,7 @@ class AgentPolicy:
 
 @dataclasses.dataclass(frozen=True)
 class PlannerUse:
-    """What planning took over some episodes; sums with `+`."""
+    """Cost of planning over some episodes; sums with `+`."""
 
     steps: int = 0
     """Environment steps that were planned."""
@@ -143,7 +144,7 @@ class PlannerUse:
     timed_steps: int = 0
     """Environment steps that were timed, those of surplus environments included."""
     seconds: float = 0.0
-    """What the timed steps took."""
+    """Of the timed steps."""
 
     def __add__(self, other: "PlannerUse") -> "PlannerUse":
         mine, others = dataclasses.astuple(self), dataclasses.astuple(other)
@@ -159,7 +160,7 @@ class Rollout:
     invalid: Mapping[int, str] = dataclasses.field(default_factory=dict)
     """Why an episode is left out, by its number among those asked for."""
     seconds: float = 0.0
-    """What all of it took."""
+    """Of all of it."""
 
     @property
     def numbers(self) -> list[int]:

@@ -1,4 +1,4 @@
-"""What a trained model has learned: head shares per physics, error by imagined step."""
+"""Tables of what a model has learned: head shares per physics, error by imagined step."""
 
 from collections import defaultdict
 from typing import Any

@@ -59,7 +59,7 @@ class Tests:
 
 @dataclasses.dataclass(frozen=True)
 class PlanningCost:
-    """What planning one step of one environment took, on average over some episodes."""
+    """Cost of planning one step of one environment, on average over some episodes."""
 
     evaluations_per_step: float
     """Candidates that were scored; fewer than the settings allow where searches end early."""

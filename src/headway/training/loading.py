@@ -24,7 +24,7 @@ def learner_of(config: Config, task: Task) -> Learner:
 
 
 def initial(config: Config, task: Task) -> Learned:
-    """What a seed begins with, untrained."""
+    """The untrained model that a seed begins with."""
     key = jax.random.fold_in(jax.random.key(config.seed), 0)
     return learner_of(config, task).initial(key)
 

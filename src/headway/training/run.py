@@ -19,36 +19,43 @@ there, so whatever an interrupted iteration left behind is written again.
 import contextlib
 import csv
 import dataclasses
-import errno
 import hashlib
 import importlib.metadata
 import io
 import json
-import os
 import platform
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import filelock
 import jax
-import jax.numpy as jnp
 import numpy as np
-import safetensors.numpy
-from safetensors import SafetensorError, safe_open
 
 from headway.config import Config, differences, from_dict, to_dict, tolerating_as
 from headway.data import Trajectory
-from headway.errors import BusyError, HeadwayError, LimitError, RunError
-
-Tree = TypeVar("Tree")
-Arrays = dict[str, np.ndarray]
+from headway.errors import BusyError, RunError
+from headway.training.files import (
+    UNFINISHED,
+    Arrays,
+    Tree,
+    arrays_bytes,
+    csv_text,
+    load_arrays,
+    make_dir,
+    reading,
+    remove,
+    tree_arrays,
+    tree_from_arrays,
+    write_bytes,
+    write_json,
+    writing,
+)
 
 SCHEMA = 3  # of a run directory
 KEPT = 2  # iterations whose checkpoints and tests stay, so that there is one to go back to
 LOCK = ".lock"
-UNFINISHED = ".writing"  # ends the name of a file that is not complete yet
 VERSIONED = ("headway", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco")
 EVALUATION_COLUMNS = (
     "method", "env", "seed", "iteration", "group", "sim_params", "episode", "return", "length",
@@ -70,19 +77,19 @@ class EpisodeRow:
     """One test episode; a row of `evaluation.csv`."""
 
     method: str
-    """What was trained."""
+    """Name of the method."""
     env: str
     """Short name of the environment."""
     seed: int
     """The run's seed."""
     iteration: int
-    """After which iteration it was tested, counted from 0."""
+    """The iteration after which it was tested, from 0."""
     group: str
     """`"train"` or the name of an unseen group."""
     sim_params: Mapping[str, float]
     """The physics of the episode."""
     episode: int
-    """Which of the group's episodes, counted from 0."""
+    """Number of the episode in its group, from 0."""
     episode_return: float
     """Undiscounted sum of rewards; `return` in the table."""
     length: int
@@ -90,10 +97,8 @@ class EpisodeRow:
 
     def to_csv(self) -> dict[str, Any]:
         """The row as it is written."""
-        physics = format_sim_params(self.sim_params)
-        return dict(
-            zip(EVALUATION_COLUMNS, (*vars(self).values(),), strict=True), sim_params=physics
-        )
+        cells = dict(zip(EVALUATION_COLUMNS, vars(self).values(), strict=True))
+        return cells | {"sim_params": format_sim_params(self.sim_params)}
 
 
 def format_sim_params(sim_params: Mapping[str, float]) -> str:
@@ -122,7 +127,7 @@ class RunDir:
 
     @property
     def figures(self) -> Path:
-        """Where figures go."""
+        """The folder of the figures."""
         return self.path / "figures"
 
     @contextlib.contextmanager
@@ -145,8 +150,8 @@ class RunDir:
                 " made by `headway train`; choose another --run-dir."
             )
         lock = filelock.FileLock(self.path / LOCK)
-        with _writing(self.path):
-            _make_dir(self.path)
+        with writing(self.path):
+            make_dir(self.path)
             try:
                 lock.acquire(timeout=0)
             except filelock.Timeout:
@@ -169,15 +174,15 @@ class RunDir:
                 message says how to go back.
         """
         if self._is_new():
-            facts = {
+            versions = {name: importlib.metadata.version(name) for name in VERSIONED}
+            metadata = {
                 "schema": SCHEMA,
                 "config": to_dict(config),
-                "versions": {name: importlib.metadata.version(name) for name in VERSIONED}
-                | {"python": platform.python_version()},
+                "versions": {"python": platform.python_version(), **versions},
                 "device": str(jax.devices()[0].device_kind),
                 "commit": _commit(),
             }
-            write_json(self.path / "config.json", facts)
+            write_json(self.path / "config.json", metadata)
         found = differences(tolerating_as(self.config(), config), config)
         if found:
             raise RunError(
@@ -196,13 +201,14 @@ class RunDir:
         path = self.path / "config.json"
         if not self.path.is_dir():
             raise RunError(f"{self.path} is not a directory, allowed: a run directory.")
-        with _reading(path):
+        with reading(path):
             values = json.loads(path.read_bytes())
-            if values["schema"] == SCHEMA:
-                return values
+            schema = values["schema"]
+        if schema == SCHEMA:
+            return values
         raise RunError(
-            f"{path} has schema {str(values['schema'])[:20]}, allowed: {SCHEMA}; train the run"
-            " again, or use the version of headway that made it."
+            f"{path} has schema {str(schema)[:20]}, allowed: {SCHEMA}; train the run again, or use"
+            " the version of headway that made it."
         )
 
     def config(self) -> Config:
@@ -212,7 +218,7 @@ class RunDir:
             RunError: As `metadata`.
         """
         values = self.metadata()
-        with _reading(self.path / "config.json"):
+        with reading(self.path / "config.json"):
             return from_dict(values["config"])
 
     @property
@@ -243,13 +249,14 @@ class RunDir:
         Raises:
             RunError: A file is damaged or gone; the message says how to go back.
         """
-        self._check(self.finished_iterations - 1)
         finished = self.finished_iterations
-        beyond = [number for number in self._numbers("checkpoints") if number > finished]
-        if beyond:
+        with self._advice():
+            self._check(finished - 1)
+        newest = max(self._numbers("checkpoints"), default=0)
+        if newest > finished:
             raise RunError(
                 f"{self.path / 'checksums'} holds {finished} iterations, but the checkpoint of"
-                f" iteration {beyond[-1]} exists; restore checksums/ or delete the run."
+                f" iteration {newest} exists; restore checksums/ or delete the run."
             )
 
     def metrics(self) -> list[dict[str, Any]]:
@@ -259,13 +266,13 @@ class RunDir:
             RunError: The file is damaged.
         """
         text = self._table("metrics.jsonl")
-        with _reading(self.path / "metrics.jsonl"):
+        with reading(self.path / "metrics.jsonl"):
             return [json.loads(line) for line in text.splitlines()]
 
     def evaluation(self) -> list[EpisodeRow]:
         """Every test episode of the finished iterations."""
         rows = self._rows("evaluation.csv")
-        with _reading(self.path / "evaluation.csv"):
+        with reading(self.path / "evaluation.csv"):
             return [
                 EpisodeRow(*{**row, "sim_params": parse_sim_params(row["sim_params"])}.values())
                 for row in rows
@@ -288,19 +295,21 @@ class RunDir:
         Raises:
             RunError: No iteration is finished, or the checkpoint is damaged or of another model.
         """
-        path = self._file("checkpoints", self.last_iteration)
-        if not path.parent.exists():
-            raise RunError(
-                f"{self.path} is a copy without checkpoints, allowed: a run with them; name the"
-                " run itself."
-            )
-        for name in ("config.json", self._name(path)):
-            self._checked(name)
-        return tree_from_arrays(template, load_arrays(path)[0], path)
+        name = _name("checkpoints", self.last_iteration)
+        self._checked("config.json")
+        self._checked(name)
+        return tree_from_arrays(template, load_arrays(self.path / name)[0], self.path / name)
 
     def iteration_data(self, iteration: int) -> list[Trajectory]:
-        """The trajectories that an iteration collected."""
-        return load_trajectories(self._file("data", iteration))
+        """The trajectories that an iteration collected.
+
+        Raises:
+            RunError: Their file is missing or damaged.
+        """
+        path = self.path / _name("data", iteration)
+        arrays, facts = load_arrays(path)
+        with reading(path):
+            return trajectories_from(arrays, facts)
 
     def load_data(self) -> list[Trajectory]:
         """All trajectories that the finished iterations collected."""
@@ -312,14 +321,14 @@ class RunDir:
         Raises:
             RunError: They are damaged; the message says how to go back.
         """
-        path = self._file("tests", self.last_iteration)
-        if self._name(path) not in self._checksums(self.last_iteration):
-            return {}
-        self._checked(self._name(path))
-        found: dict[str, list[Trajectory]] = {}
-        groups = load_arrays(path)[1]["groups"]
-        for group, trajectory in zip(groups, load_trajectories(path), strict=True):
-            found.setdefault(group, []).append(trajectory)
+        name, found = _name("tests", self.last_iteration), {}
+        if name in self._checksums(self.last_iteration):
+            self._checked(name)
+            arrays, facts = load_arrays(self.path / name)
+            for group, episode in zip(
+                facts["groups"], trajectories_from(arrays, facts), strict=True
+            ):
+                found.setdefault(group, []).append(episode)
         return found
 
     def save_iteration(
@@ -341,42 +350,34 @@ class RunDir:
 
         Raises:
             LimitError: The disk is full; nothing counts that is not complete.
-            RunError: A file cannot be written, or a metric is not finite.
+            RunError: A file cannot be written.
         """
         iteration = metrics["iteration"]
-        known = self._checksums(iteration - 1)
-        save_arrays(self._file("checkpoints", iteration), tree_arrays(learned))
-        written = ["config.json", self._name(self._file("checkpoints", iteration))]
+        files = {_name("checkpoints", iteration): arrays_bytes(tree_arrays(learned))}
         if collected:
-            save_trajectories(self._file("data", iteration), collected)
-            written.append(self._name(self._file("data", iteration)))
+            files[_name("data", iteration)] = arrays_bytes(*trajectory_arrays(collected))
         if tests:
             groups = [group for group, episodes in tests.items() for _ in episodes]
-            episodes = [episode for group in tests.values() for episode in group]
-            save_trajectories(self._file("tests", iteration), episodes, groups=groups)
-            written.append(self._name(self._file("tests", iteration)))
-        try:
-            lines = {"metrics.jsonl": json.dumps(metrics, allow_nan=False) + "\n"}
-        except ValueError:
-            raise RunError(
-                f"{self.path / 'metrics.jsonl'} cannot take a number that is not finite; check the"
-                " rewards of the environment."
-            ) from None
+            arrays, facts = trajectory_arrays([t for found in tests.values() for t in found])
+            files[_name("tests", iteration)] = arrays_bytes(arrays, {**facts, "groups": groups})
+        lines = {"metrics.jsonl": json.dumps(metrics, allow_nan=False) + "\n"}
         for name, columns in TABLES.items():
             lines[name] = csv_text(columns, tables.get(name, ()), header=iteration == 0)
-        for name, text in lines.items():
-            write_bytes(self.path / name, self._table(name) + text.encode())
-            written.append(name)
-        found = {name: digest for name, digest in known.items() if name.startswith("data/")}
-        found |= {name: _digest((self.path / name).read_bytes()) for name in written}
-        write_json(self._file("checksums", iteration), found)
+        files |= {name: self._table(name) + text.encode() for name, text in lines.items()}
+        known = self._checksums(iteration - 1)
+        for name, content in files.items():
+            write_bytes(self.path / name, content)
+        files["config.json"] = (self.path / "config.json").read_bytes()
+        data = {name: digest for name, digest in known.items() if name.startswith("data/")}
+        checksums = data | {name: _digest(content) for name, content in files.items()}
+        write_json(self.path / _name("checksums", iteration), checksums)
         self._tidy()
 
     def last_good(self) -> int | None:
         """The newest finished iteration whose files are all as they were written."""
         for iteration in reversed(self._numbers("checksums")):
             with contextlib.suppress(RunError):
-                self._check(iteration, advice=False)
+                self._check(iteration)
                 return iteration
         return None
 
@@ -397,43 +398,36 @@ class RunDir:
             )
         for iteration in reversed(numbers):
             if good is not None and iteration > good:
-                _remove(self._file("checksums", iteration))
+                remove(self.path / _name("checksums", iteration))
         return good
 
     def partial(self) -> "Partial":
-        """What is done of the iteration after the last finished one."""
+        """Finished parts of the iteration after the last one that counts."""
         origin = (self.path / "config.json").read_bytes()
         origin += importlib.metadata.version("headway").encode()
         if self.finished_iterations:
-            origin += self._file("checksums", self.last_iteration).read_bytes()
+            origin += (self.path / _name("checksums", self.last_iteration)).read_bytes()
         return Partial(self.path / "partial", hashlib.sha256(origin).hexdigest())
 
     def _is_new(self) -> bool:
         found = self.path.iterdir() if self.path.exists() else ()
         return all(path.name.endswith(UNFINISHED) or path.name == LOCK for path in found)
 
-    def _file(self, folder: str, iteration: int) -> Path:
-        suffix = "json" if folder == "checksums" else "safetensors"
-        return self.path / folder / f"iteration-{iteration:03d}.{suffix}"
-
-    def _name(self, path: Path) -> str:
-        return path.relative_to(self.path).as_posix()
-
     def _numbers(self, folder: str) -> list[int]:
+        """The iterations that have a file in a folder."""
         stems = [path.stem for path in (self.path / folder).glob("iteration-*")]
         return sorted(int(stem[10:]) for stem in stems if stem[10:].isdigit())
 
     def _checksums(self, iteration: int) -> dict[str, Any]:
         if iteration < 0:
             return {}
-        path = self._file("checksums", iteration)
-        with _reading(path):
+        path = self.path / _name("checksums", iteration)
+        with reading(path):
             return dict(json.loads(path.read_bytes()))
 
-    def _check(self, iteration: int, *, advice: bool = True) -> None:
-        with self._advice() if advice else contextlib.nullcontext():
-            for name, digest in self._checksums(iteration).items():
-                _checked(self.path / name, digest)
+    def _check(self, iteration: int) -> None:
+        for name, digest in self._checksums(iteration).items():
+            _checked(self.path / name, digest)
 
     def _checked(self, name: str) -> bytes:
         """The part of a file that counts for the newest iteration, as it was written."""
@@ -448,7 +442,7 @@ class RunDir:
 
     def _rows(self, name: str) -> list[dict[str, Any]]:
         text = self._table(name).decode()
-        with _reading(self.path / name):
+        with reading(self.path / name):
             return [
                 {column: _TYPES.get(column, str)(cell) for column, cell in row.items()}
                 for row in csv.DictReader(io.StringIO(text, newline=""))
@@ -475,10 +469,10 @@ class RunDir:
         last = self.finished_iterations - 1
         for folder in ("checksums", "checkpoints", "tests"):
             for iteration in self._numbers(folder):
-                if last >= 0 and iteration not in range(last - KEPT + 1, last + 2):
-                    _remove(self._file(folder, iteration))
+                if last >= 0 and not last - KEPT < iteration <= last + 1:
+                    remove(self.path / _name(folder, iteration))
         for path in self.path.rglob(f".*{UNFINISHED}"):
-            _remove(path)
+            remove(path)
 
 
 class Partial:
@@ -495,6 +489,10 @@ class Partial:
     def __init__(self, folder: Path, origin: str):
         self._folder, self._origin = folder, origin
 
+    def path(self, name: str) -> Path:
+        """The file of a part."""
+        return self._folder / f"{name}.safetensors"
+
     def save(self, name: str, arrays: Arrays, facts: Mapping[str, Any]) -> None:
         """Write a part, in place of an earlier one of that name.
 
@@ -503,79 +501,29 @@ class Partial:
             arrays: By name.
             facts: Values for JSON.
         """
-        digest = _part_digest(self._origin, arrays, facts)
-        save_arrays(self.path(name), arrays, {"part": facts, "sha256": digest})
+        sealed = {"part": facts, "sha256": self._digest(arrays, facts)}
+        write_bytes(self.path(name), arrays_bytes(arrays, sealed))
 
     def load(self, name: str) -> tuple[Arrays, dict[str, Any]] | None:
         """Arrays and facts of a part; None where there is none that counts."""
         with contextlib.suppress(RunError, KeyError):
             arrays, facts = load_arrays(self.path(name))
-            if facts["sha256"] == _part_digest(self._origin, arrays, facts["part"]):
+            if facts["sha256"] == self._digest(arrays, facts["part"]):
                 return arrays, facts["part"]
         return None
 
     def remove(self, names: str = "*") -> None:
         """Delete parts; all of them, or those whose names match a pattern."""
         for path in self._folder.glob(f"{names}.safetensors"):
-            _remove(path)
-        with contextlib.suppress(OSError):  # somebody else's file stays, and so the folder
+            remove(path)
+        with contextlib.suppress(OSError):  # other parts stay, and so the folder
             self._folder.rmdir()
 
-    def path(self, name: str) -> Path:
-        """The file of a part."""
-        return self._folder / f"{name}.safetensors"
-
-
-def _part_digest(origin: str, arrays: Arrays, facts: Mapping[str, Any]) -> str:
-    found = hashlib.sha256(f"{origin} {json.dumps(facts)}".encode())
-    for name, array in sorted(arrays.items()):
-        found.update(f"{name} {array.dtype} {array.shape}".encode() + array.tobytes())
-    return found.hexdigest()
-
-
-def tree_arrays(tree: Any) -> Arrays:
-    """The arrays of a pytree, named by their place in it; random keys become numbers."""
-    return {name: np.asarray(_plain(leaf)) for name, leaf in _named_leaves(tree)}
-
-
-def tree_from_arrays(template: Tree, arrays: Arrays, path: Path) -> Tree:
-    """Build a pytree from what `tree_arrays` gave.
-
-    Args:
-        template: A pytree of arrays or shapes with the same structure.
-        arrays: By name.
-        path: Their file, for messages.
-
-    Raises:
-        RunError: An array is missing, too many, or has another shape or type.
-    """
-    wanted = {name: jax.eval_shape(_plain, leaf) for name, leaf in _named_leaves(template)}
-    if set(wanted) != set(arrays):
-        raise RunError(f"{path} holds other arrays than the run's model has; it is not its file.")
-    for name, leaf in wanted.items():
-        got = arrays[name]
-        if (got.shape, got.dtype) != (leaf.shape, leaf.dtype):
-            raise RunError(
-                f"{path}: {name} is {got.dtype}{list(got.shape)}, allowed:"
-                f" {leaf.dtype}{list(leaf.shape)}; the file belongs to another model."
-            )
-    leaves = [
-        jax.random.wrap_key_data(jnp.asarray(arrays[name]))
-        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        else jnp.asarray(arrays[name])
-        for name, leaf in _named_leaves(template)
-    ]
-    return jax.tree.unflatten(jax.tree.structure(template), leaves)
-
-
-def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
-    flat, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return [(jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in flat]
-
-
-def _plain(leaf: Any) -> Any:
-    is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-    return jax.random.key_data(leaf) if is_key else leaf
+    def _digest(self, arrays: Arrays, facts: Mapping[str, Any]) -> str:
+        found = hashlib.sha256(f"{self._origin} {json.dumps(facts)}".encode())
+        for name, array in sorted(arrays.items()):
+            found.update(f"{name} {array.dtype} {array.shape}".encode() + array.tobytes())
+        return found.hexdigest()
 
 
 def trajectory_arrays(trajectories: Sequence[Trajectory]) -> tuple[Arrays, dict[str, Any]]:
@@ -599,150 +547,14 @@ def trajectories_from(arrays: Arrays, facts: Mapping[str, Any]) -> list[Trajecto
     ]
 
 
-def save_trajectories(path: Path, trajectories: Sequence[Trajectory], **facts: Any) -> None:
-    """Write trajectories, and facts for JSON."""
-    arrays, more = trajectory_arrays(trajectories)
-    save_arrays(path, arrays, {**more, **facts})
-
-
-def load_trajectories(path: Path) -> list[Trajectory]:
-    """Read what `save_trajectories` wrote.
-
-    Raises:
-        RunError: The file is missing or damaged.
-    """
-    arrays, facts = load_arrays(path)
-    with _reading(path):
-        return trajectories_from(arrays, facts)
-
-
-def save_arrays(path: Path, arrays: Arrays, facts: Mapping[str, Any] | None = None) -> None:
-    """Write named arrays as safetensors, with facts for JSON in the file's header."""
-    write_bytes(path, safetensors.numpy.save(arrays, {"facts": json.dumps(facts or {})}))
-
-
-def load_arrays(path: Path) -> tuple[Arrays, dict[str, Any]]:
-    """Read the arrays and the facts that `save_arrays` wrote.
-
-    Raises:
-        RunError: The file is missing or damaged.
-    """
-    with _reading(path), safe_open(path, "numpy") as file:
-        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        return arrays, json.loads((file.metadata() or {})["facts"])
-
-
-def csv_text(
-    columns: Sequence[str], rows: Iterable[Mapping[str, Any]], *, header: bool = True
-) -> str:
-    """Rows of a table."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    if header:
-        writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write one JSON document."""
-    write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a whole file under a temporary name, then rename it into place.
-
-    When this returns, the file survives a loss of power; until then the old one does.
-
-    Raises:
-        LimitError: The disk is full.
-        RunError: Something else than a regular file has this name, or it cannot be written.
-    """
-    check_target(path)
-    temporary = path.with_name(f".{path.name}{UNFINISHED}")
-    try:
-        with _writing(path):
-            _make_dir(path.parent)
-            temporary.unlink(missing_ok=True)  # never written through somebody's link
-            with temporary.open("xb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)  # noqa: PTH105
-            _sync_dir(path.parent)
-    except HeadwayError:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise
-
-
-def check_target(path: Path) -> None:
-    """Refuse to write where no file can be, or where a device or a directory would be replaced.
-
-    Raises:
-        RunError: The path ends with no name, or with that of something else than a regular file.
-    """
-    if not path.name or (path.exists() and not path.is_file()):
-        raise RunError(
-            f"{path} is no regular file, allowed: the name of a new file or of one to replace;"
-            " choose another name."
-        )
-
-
-def _remove(path: Path) -> None:
-    with _writing(path):
-        path.unlink(missing_ok=True)
-        _sync_dir(path.parent)
-
-
-def _make_dir(path: Path) -> None:
-    if not path.is_dir():
-        _make_dir(path.parent)
-        path.mkdir(exist_ok=True)
-        _sync_dir(path.parent)
-
-
-def _sync_dir(path: Path) -> None:
-    """Make renames and deletions survive a loss of power, where a file system can promise it."""
-    if os.name == "posix":
-        handle = os.open(path, os.O_RDONLY)
-        try:
-            with contextlib.suppress(OSError):
-                os.fsync(handle)
-        finally:
-            os.close(handle)
-
-
-@contextlib.contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    """Turn what a file system refuses into one line."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise LimitError(
-                f"the disk is too full to write {path}; free some space, then the same command"
-                " goes on."
-            ) from None
-        raise RunError(f"{path} cannot be written: {error.strerror}; check the path.") from None
-
-
-@contextlib.contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Name a file that is missing, or not as it was written, in one line."""
-    try:
-        yield
-    except FileNotFoundError:
-        raise RunError(f"{path} is missing; check the path, or restore the file.") from None
-    except OSError as error:
-        raise RunError(f"{path} cannot be read: {error.strerror}; check the path.") from None
-    except (SafetensorError, HeadwayError, ValueError, KeyError, TypeError) as error:
-        reason = " ".join(str(error).split())[:300]
-        raise RunError(f"{path} is damaged: {reason}.") from None
+def _name(folder: str, iteration: int) -> str:
+    suffix = "json" if folder == "checksums" else "safetensors"
+    return f"{folder}/iteration-{iteration:03d}.{suffix}"
 
 
 def _checked(path: Path, digest: Mapping[str, Any]) -> bytes:
-    with _reading(path):
+    """The first bytes of a file, which have the checksum that they should have."""
+    with reading(path):
         content = path.read_bytes()[: digest["bytes"]]
         if _digest(content) != digest:
             raise ValueError("its bytes are not the ones that were written")
@@ -756,10 +568,8 @@ def _digest(content: bytes) -> dict[str, Any]:
 def _commit() -> str | None:
     """The commit of the checkout that Headway is imported from; None where there is none."""
     root = Path(__file__).parents[3]
-    if not (root / ".git").exists():
-        return None
     words = ["git", "-C", str(root), "rev-parse", "HEAD"]
-    try:
-        return subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return None
+    if (root / ".git").exists():
+        with contextlib.suppress(OSError, subprocess.CalledProcessError):
+            return subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
+    return None

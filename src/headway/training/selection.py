@@ -1,4 +1,4 @@
-"""How well heads are selected, and how well a model knows its own error, on test episodes.
+"""Head selection and calibration, measured on test episodes.
 
 Every transition is predicted by all heads before it happens, with the context, the selection and
 the corrections that the agent had at that moment. Errors are mean squares over dimensions in
@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy import stats
 
 from headway.data import Trajectory, sim_params_row
@@ -25,7 +25,7 @@ LEVELS = (0.5, 0.9, 0.95)  # central intervals that are counted
 
 @dataclasses.dataclass(frozen=True)
 class EpisodeSelection:
-    """What all heads predicted in one episode, from its second step on."""
+    """Errors of all heads in one episode, from its second step on."""
 
     sim_params: Mapping[str, float]
     errors: Float[np.ndarray, "step member head"]
@@ -66,7 +66,7 @@ class EpisodeSelection:
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """Whether the truth falls where the predicted variance says."""
+    """Calibration of the predicted variance."""
 
     mean_square: float
     """Mean square of the error in predicted standard deviations: 1 is right, more means that the
@@ -77,7 +77,7 @@ class Calibration:
 
 @dataclasses.dataclass(frozen=True)
 class SelectionSummary:
-    """How heads were selected over some episodes; errors are means over steps and members."""
+    """Head selection over some episodes; errors are means over steps and members."""
 
     episodes: int
     head_errors: Float[np.ndarray, "member head"]
@@ -99,7 +99,7 @@ class SelectionSummary:
 
     @property
     def regret(self) -> float:
-        """What selecting costs against the best head in hindsight; below 0 where switching pays."""
+        """Cost of selecting against the best head in hindsight; below 0 where switching pays."""
         return self.chosen_error - self.best_error
 
 
@@ -205,8 +205,6 @@ def _calibration(episodes: Sequence[EpisodeSelection]) -> Calibration | None:
     if not found:
         return None
     deviations = np.abs(np.concatenate(found).astype(np.float64))
-    inside: dict[float, float] = {}
-    for level in LEVELS:
-        within: Bool[np.ndarray, " sample"] = deviations <= stats.norm.ppf(0.5 + level / 2)
-        inside[level] = float(within.mean())
+    bounds = {level: stats.norm.ppf(0.5 + level / 2) for level in LEVELS}
+    inside = {level: float((deviations <= bound).mean()) for level, bound in bounds.items()}
     return Calibration(float(np.square(deviations).mean()), inside)

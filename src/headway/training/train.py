@@ -25,9 +25,10 @@ from headway.training.collect import (
     run_episodes,
 )
 from headway.training.evaluate import Tests, evaluate_agent
+from headway.training.files import tree_arrays, tree_from_arrays
 from headway.training.loading import initial, load_learned
 from headway.training.progress import Progress
-from headway.training.run import Partial, RunDir, tree_arrays, tree_from_arrays
+from headway.training.run import Partial, RunDir
 from headway.training.stopping import StopRequest, stop_requests
 
 SAVE_EVERY = 30.0  # seconds between two writes of an unfinished fit
