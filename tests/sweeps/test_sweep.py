@@ -131,6 +131,16 @@ def test_a_run_that_another_process_holds_is_waited_for(tmp_path, monkeypatch):
     assert job.state.name == "done"
 
 
+def test_an_environment_of_ones_own_is_found_by_the_workers(tmp_path, monkeypatch):
+    module = "from headway.task import env_spec\n\n\ndef cart():\n    return env_spec('pendulum')\n"
+    (tmp_path / "own_carts.py").write_text(module)
+    monkeypatch.syspath_prepend(tmp_path)
+    experiment = sweep_experiment("own", ["random"], {})
+    jobs = Comparison(experiment, ("own_carts:cart",), (0,), "smoke", tmp_path).jobs
+    assert run_jobs(jobs, HERE) == {}
+    assert [job.state.name for job in jobs] == ["done"]
+
+
 def test_a_run_that_loses_all_its_workers_fails_and_says_so(tmp_path, monkeypatch):
     (tmp_path / "sitecustomize.py").write_text("import os\nos._exit(9)\n")
     monkeypatch.syspath_prepend(tmp_path)  # every worker dies while Python starts
