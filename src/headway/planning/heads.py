@@ -87,10 +87,15 @@ class MultiHeadModel(Model):
         layer = None
         if self.prior is not None and self.planner.adaptation != "none":
             layer = LastLayer.init(self.prior, num_envs, self.net.num_heads)
-        like = eqx.filter_eval_shape(self.context, recent, sim_params)
+        encoder, (obs, action, *_) = self.net.context_encoder, recent
+        width = {
+            "learned": 0 if encoder is None else encoder.output.bias.shape[-1],
+            "history": self.history_length * (obs.shape[-1] + action.shape[-1]),
+            "sim-params": len(self.sim_param_names),
+        }[self.net.context_kind]
         return MultiHeadBelief(
             recent,
-            jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like),
+            jnp.zeros((self.net.num_members, num_envs, width)) if width else None,
             jnp.zeros((num_envs, self.net.num_members), jnp.int32),
             layer,
             sim_params,
