@@ -7,11 +7,11 @@ import numpy as np
 
 from headway.config import FittingConfig, MultiHeadedConfig, PlannerConfig
 from headway.data import Episodes, Samples, Trajectory
+from headway.models.acting import MultiHeadModel
 from headway.models.fitting import FitData, FitSetup, FitState, make_data
 from headway.models.last_layer import Prior
 from headway.models.multi_headed import MultiHeadDynamics, Statistics
 from headway.planning.agent import Agent, AgentState
-from headway.planning.heads import MultiHeadModel
 from headway.task import Task, env_spec
 
 EPISODE_LENGTH = 200

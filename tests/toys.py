@@ -8,10 +8,10 @@ import numpy as np
 
 from headway.config import MultiHeadedConfig
 from headway.data import Episodes, Samples, Trajectory
+from headway.models.acting import MultiHeadModel
 from headway.models.multi_headed import MultiHeadDynamics, Statistics
 from headway.models.networks import Dense, DenseHeads, GaussianNet
 from headway.planning.agent import Agent
-from headway.planning.heads import MultiHeadModel
 from headway.planning.optimizers import where_env
 from headway.task import Task
 

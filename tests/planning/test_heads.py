@@ -11,6 +11,14 @@ import pytest
 import toys
 from headway.config import CEMConfig, PlannerConfig
 from headway.errors import ConfigError
+from headway.models.acting import (
+    MultiHeadModel,
+    bounded_var,
+    fold,
+    head_errors,
+    rough_swish,
+    select_heads,
+)
 from headway.models.base import RecentTransitions, Transition
 from headway.models.multi_headed import MultiHeadDynamics, network_input
 from headway.models.networks import (
@@ -23,14 +31,6 @@ from headway.models.networks import (
 )
 from headway.planning.controller import Controller
 from headway.planning.flop import plan_flop
-from headway.planning.heads import (
-    MultiHeadModel,
-    bounded_var,
-    fold,
-    head_errors,
-    rough_swish,
-    select_heads,
-)
 
 UP, DOWN = 1.0, -1.0
 NET = toys.linear_model([[np.eye(2), -np.eye(2)], [-np.eye(2), np.eye(2)]])

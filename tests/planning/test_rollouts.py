@@ -9,10 +9,10 @@ import pytest
 
 import toys
 from headway.config import PlannerConfig
+from headway.models.acting import MultiHeadModel, fold
 from headway.models.multi_headed import MultiHeadDynamics
 from headway.models.networks import DenseHeads, GaussianNet
 from headway.planning import cpu
-from headway.planning.heads import MultiHeadModel, fold
 from headway.planning.rollouts import candidate_returns
 
 KEY = jax.random.key(0)

@@ -10,11 +10,11 @@ from jaxtyping import Float, PRNGKeyArray
 
 from headway.data import Episodes, Trajectory
 from headway.experiment.learners.base import Epochs, Fit, Learned, Learner
+from headway.models.acting import MultiHeadModel
 from headway.models.fitting import FitState, episode_losses, fit_epoch
 from headway.models.last_layer_prior import fit_prior
 from headway.models.multi_headed import MultiHeadDynamics, Statistics
 from headway.planning.agent import Agent
-from headway.planning.heads import MultiHeadModel
 from headway.training.collect import Environments
 from headway.training.diagnostics import head_shares
 from headway.training.methods import told_sim_params
