@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import headway
+from headway.config import CEMConfig
 from headway.errors import ConfigError, RunError
 from headway.training.run import RunDir
 
@@ -29,18 +30,20 @@ def test_a_controller_can_go_on_learning(root):
     controller = headway.load(root, settings={"planner.adaptation": "last-layer"})
     for _ in range(2):
         controller.act(OBS)
-    assert controller.agent.prior is not None
+    assert controller.agent.model.prior is not None
     assert np.abs(controller._state.belief.last_layer.weight).max() > 0
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"model.num_heads": 3}, "model.num_heads is fixed by training"),
-        ({"evaluation.num_episodes": 3}, "evaluation.num_episodes means nothing to a controller"),
-        ({"collection.max_bad_episodes": 3}, "collection.max_bad_episodes means nothing"),
+        ({"model.num_heads": 3}, "model.num_heads cannot change here"),
+        (
+            {"evaluation.num_episodes": 3},
+            "evaluation.num_episodes cannot change here",
+        ),
         ({"planner.num_candidate": 3}, "unknown setting .* Did you mean 'planner.num_candidates'"),
-        ({"planner.num_candidates": 0}, "bad planner settings: num_candidates is 0"),
+        ({"planner.num_candidates": 0}, "planner.num_candidates is 0, allowed: greater"),
     ],
 )
 def test_what_a_controller_cannot_use_is_refused(settings, message, root):

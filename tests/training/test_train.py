@@ -110,7 +110,10 @@ def test_a_run_can_be_tested_with_another_planner(settings, evaluations, referen
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"model.num_heads": 2}, r"model\.num_heads is fixed by training, allowed:"),
+        (
+            {"model.num_heads": 2},
+            r"model\.num_heads cannot change here, allowed: settings of planner",
+        ),
         ({"planer.horizon": 2}, r"Did you mean 'planner\.horizon'"),
         ({"planner.num_candidates": 3}, r"num_elites is 4, allowed: at most num_cand"),
     ],
