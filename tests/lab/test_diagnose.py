@@ -127,7 +127,7 @@ def test_how_heads_would_be_selected(tested):
     assert learning.chosen_error < 0.7 * selected.chosen_error
     np.testing.assert_array_equal(drawn.head_errors, selected.head_errors)
     assert drawn.wrong > selected.wrong
-    with pytest.raises(ConfigError, match="fixed by training"):
+    with pytest.raises(ConfigError, match="cannot change here"):
         headway.diagnose(tested, settings={"model.num_heads": 2})
 
 
