@@ -421,7 +421,7 @@ class _Runs(Command):
         seeds = read_seeds(self.seeds)
         comparison = Comparison(experiment, self.envs, seeds, self.preset, self.out, settings)
         if self.dry_run:
-            from headway.lab.listing import states
+            from headway.lab.comparison import states
 
             entries, table = states(comparison)
             return self.show({"runs": entries}, table)
@@ -510,9 +510,62 @@ class List(Command):
 
     def run(self, words):
         """Print a table of names."""
-        from headway.lab import listing
+        from headway.lab.paper import EXPERIMENTS
+        from headway.lab.tables import axis_label, new_table, value_label, varying
+        from headway.task import env_names, env_spec
+        from headway.training.methods import METHODS, PRESETS
 
-        entries, table = getattr(listing, self.what)()
+        entries: list[dict[str, Any]] = []
+        if self.what == "envs":
+            table = new_table("Environments", "name", "what varies", "training", "unseen")
+            table.columns[0].no_wrap = True
+            for name in ("obs", "action", "steps"):
+                table.add_column(name, justify="right")
+            table.add_column("options", overflow="fold")
+            for spec in map(env_spec, env_names()):
+                task, sets = spec.make_task(**spec.options), spec.sim_params
+                groups = {name: list(map(dict, sets.group(name))) for name in sets.group_names}
+                sizes = {
+                    "obs_size": task.obs_size,
+                    "action_size": task.action_size,
+                    "episode_length": spec.episode_length,
+                }
+                entries.append(
+                    {"name": spec.name, "id": spec.env_id, "description": spec.description}
+                    | sizes
+                    | {"sim_params": groups, "options": dict(spec.options)}
+                )
+                names = varying([physics for group in groups.values() for physics in group])
+                train, *unseen = (
+                    ", ".join(value_label(physics, names) for physics in group)
+                    for group in groups.values()
+                )
+                cells = [spec.name, axis_label(names), train, "\n".join(unseen)]
+                options = "\n".join(spec.options) or "–"
+                table.add_row(*cells, *map(str, sizes.values()), options)
+        elif self.what == "methods":
+            table = new_table("Methods", "name", "description", "settings that differ from tmcl")
+            usual = flatten(to_dict(Config(env="pendulum")))
+            for method in METHODS.values():
+                # What is the same in the paper's preset is set because another preset changes it.
+                settings = flatten(method.settings).items()
+                chosen = {name: value for name, value in settings if value != usual.get(name)}
+                about = {"name": method.name, "description": method.description}
+                entries.append({**about, "settings": chosen})
+                changes = "\n".join(f"{name} {value}" for name, value in chosen.items())
+                table.add_row(*about.values(), changes or "–")
+        elif self.what == "presets":
+            table = new_table("Presets", "name", "description")
+            for preset in PRESETS.values():
+                entries.append({"name": preset.name, "description": preset.description})
+                table.add_row(preset.name, preset.description)
+        else:
+            table = new_table("Experiments", "name", "what is compared", "arms")
+            for found in EXPERIMENTS.values():
+                arms = [dataclasses.asdict(arm) for arm in found.arms]
+                entries.append({"name": found.name, "title": found.title, "arms": arms})
+                table.add_row(found.name, found.title, ", ".join(arm["label"] for arm in arms))
+            table.caption = "headway reproduce NAME --envs pendulum --seeds 0:3 --preset quick"
         return self.show({self.what: entries}, table)
 
 

@@ -146,6 +146,8 @@ class EnvSpec:
     noise_beta: float | None = None
     """Exponent of the power spectrum of the noise with which iCEM searches in the preset `fast`;
     None searches with CEM, whose noise is white."""
+    obs_names: tuple[str, ...] = ()
+    """Entries of an observation with their units, for figures; unnamed ones are numbered."""
 
     def __post_init__(self) -> None:
         if not self.name or self.episode_length < 1 or self.epochs < 1:

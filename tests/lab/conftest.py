@@ -3,8 +3,11 @@
 import csv
 import json
 
+import fakes
 import numpy as np
 import pytest
+
+from headway.lab import comparison
 
 GROUPS = {"train": (0.5, 0.75, 1.0, 1.25), "low": (0.25, 0.375), "high": (1.5, 1.75)}
 LEVELS = {"train": -190.0, "low": -620.0, "high": -330.0}
@@ -88,3 +91,17 @@ def folder(tmp_path):
         for seed in range(3):
             write(tmp_path / f"runs/{method}-{seed}", method=method, seed=seed, lift=lift)
     return tmp_path / "runs"
+
+
+@pytest.fixture
+def training(monkeypatch):
+    """Training that takes no time."""
+    fake = fakes.FakeTraining()
+    monkeypatch.setattr(comparison, "run_jobs", fake)
+    return fake
+
+
+@pytest.fixture
+def without_figures(monkeypatch):
+    """Figures take long to draw."""
+    monkeypatch.setattr(comparison, "draw", lambda found: [])

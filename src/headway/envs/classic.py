@@ -95,7 +95,10 @@ CARTPOLE_SWINGUP = EnvSpec(
     options={"terminate_off_track": False},
     description="swing a pole of unknown mass up by its cart, also of unknown mass",
     noise_beta=0.25,
-)
+    obs_names=(
+        "cart position (m)", "cart velocity (m/s)", "cos θ", "sin θ", "pole rate (rad/s)",
+    ),
+)  # fmt: skip
 
 
 class CartPoleSwingUp(ClassicWorld):
@@ -213,6 +216,7 @@ PENDULUM = EnvSpec(
     description="swing a pendulum of unknown length up",
     epochs=5,
     noise_beta=0.25,
+    obs_names=("cos θ", "sin θ", "angular velocity (rad/s)"),
 )
 
 

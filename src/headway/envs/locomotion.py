@@ -182,6 +182,19 @@ class HopperTask(Task):
         return next_obs.at[..., 11].set(delta[..., 11])
 
 
+_QUATERNION = tuple(f"torso quaternion {part}" for part in "wxyz")
+_VELOCITY = tuple(f"{axis} velocity (m/s)" for axis in "xyz")
+_TURNING = tuple(f"{axis} angular velocity (rad/s)" for axis in "xyz")
+_PLANAR = ("x velocity (m/s)", "z velocity (m/s)", "torso pitch rate (rad/s)")
+
+
+def _joints(joints: str, *between: str) -> tuple[str, ...]:
+    """Name angles of joints, then other entries, then the joints' rates."""
+    names = joints.split(", ")
+    angles = (f"{name} angle (rad)" for name in names)
+    return (*angles, *between, *(f"{name} rate (rad/s)" for name in names))
+
+
 HOPPER = EnvSpec(
     name="hopper",
     env_id="headway/Hopper-v0",
@@ -191,7 +204,11 @@ HOPPER = EnvSpec(
     default_sim_params={"mass_scale": 1.0, "damping_scale": 1.0},
     options={"scale_inertia": False, "observe_average_velocity": True},
     description="hop forward on one leg with unknown masses",
-)
+    obs_names=(
+        "height (m)", "torso pitch (rad)", *_joints("thigh, leg, foot", *_PLANAR),
+        "average x velocity (m/s)",
+    ),
+)  # fmt: skip
 
 
 class Hopper(Robot):
@@ -275,7 +292,14 @@ SLIM_HUMANOID = EnvSpec(
     default_sim_params={"mass_scale": 1.0, "damping_scale": 1.0},
     options={"scale_inertia": False},
     description="walk upright as a humanoid with unknown masses",
-)
+    obs_names=(
+        "height (m)", *_QUATERNION, *_joints(
+            "abdomen z, abdomen y, abdomen x, right hip x, right hip z, right hip y, right knee,"
+            " left hip x, left hip z, left hip y, left knee, right shoulder 1, right shoulder 2,"
+            " right elbow, left shoulder 1, left shoulder 2, left elbow", *_VELOCITY, *_TURNING,
+        ),
+    ),
+)  # fmt: skip
 
 
 class SlimHumanoid(Robot):
@@ -371,7 +395,13 @@ HALF_CHEETAH = EnvSpec(
     default_sim_params={"mass_scale": 1.0, "damping_scale": 1.0},
     options={"scale_inertia": False},
     description="run forward on two legs with unknown masses",
-)
+    obs_names=(
+        "average x velocity (m/s)", "height (m)", "torso pitch (rad)",
+        *_joints(
+            "back thigh, back shin, back foot, front thigh, front shin, front foot", *_PLANAR
+        ),
+    ),
+)  # fmt: skip
 
 
 class HalfCheetah(Robot):
@@ -445,7 +475,15 @@ CRIPPLED_ANT = EnvSpec(
     default_sim_params={"crippled_leg": -1.0},
     options={"shrink_leg": False},
     description="walk on four legs, one of which does not obey",
-)
+    obs_names=(
+        "x (m)", "y (m)", "height (m)", *_QUATERNION,
+        *_joints(
+            ", ".join(f"hip {leg}, ankle {leg}" for leg in range(1, 5)), *_VELOCITY, *_TURNING
+        ),
+        *(f"torso rotation ({row}, {column})" for row in range(3) for column in range(3)),
+        "torso x (m)", "torso y (m)", "torso z (m)",
+    ),
+)  # fmt: skip
 
 
 class CrippledAnt(Robot):

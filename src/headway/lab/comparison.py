@@ -7,6 +7,7 @@ Writes a figure (PNG, SVG), every episode's return (CSV) and a table with what c
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 from rich.table import Table
@@ -303,3 +304,20 @@ def results(found: Found) -> list[Table]:
         for cells in table_rows(found, env):
             made[-1].add_row(*cells)
     return made
+
+
+def states(comparison: Comparison) -> tuple[list[dict[str, Any]], Table]:
+    """Describe every run of a comparison and how far it is, as plain values and as a table."""
+    table = tables.new_table(f"Runs of {comparison.experiment.name}", "run", "arms", "state")
+    table.add_column("iterations", justify="right")
+    entries, cells = [], comparison.cells
+    for job in comparison.jobs:
+        state, total = job.state, job.config.collection.num_iterations
+        arms = [cell.arm for cell, other in cells.items() if other.path == job.path]
+        facts = {"run_dir": str(job.path), "arms": arms, "state": state.name, "note": state.note}
+        entries.append({**facts, "finished_iterations": state.iterations, "iterations": total})
+        note = f"{state.name} {state.note}".rstrip()
+        table.add_row(job.name, ", ".join(arms), note, f"{state.iterations}/{total}")
+    missing = sum(one["state"] in ("missing", "begun") for one in entries)
+    table.caption = f"{missing} of {len(entries)} runs are missing"
+    return entries, table

@@ -14,58 +14,6 @@ from headway.lab.figures import INK, figure, legend, numbers
 from headway.lab.tables import Physics, full_label, varying
 from headway.task import EnvSpec, env_spec
 
-_HOPPER = ("thigh", "leg", "foot")
-_CHEETAH = ("back thigh", "back shin", "back foot", "front thigh", "front shin", "front foot")
-_HUMANOID = (
-    "abdomen z", "abdomen y", "abdomen x", "right hip x", "right hip z", "right hip y",
-    "right knee", "left hip x", "left hip z", "left hip y", "left knee", "right shoulder 1",
-    "right shoulder 2", "right elbow", "left shoulder 1", "left shoulder 2", "left elbow",
-)  # fmt: skip
-_ANT = tuple(f"{part} {leg}" for leg in range(1, 5) for part in ("hip", "ankle"))
-_LINEAR = tuple(f"{axis} velocity (m/s)" for axis in "xyz")
-_ANGULAR = tuple(f"{axis} angular velocity (rad/s)" for axis in "xyz")
-_QUATERNION = tuple(f"torso quaternion {part}" for part in "wxyz")
-_PLANAR = ("x velocity (m/s)", "z velocity (m/s)", "torso pitch rate (rad/s)")
-
-
-def _joints(names: Sequence[str], *between: str) -> tuple[str, ...]:
-    """Angles of joints, then other numbers, then their rates."""
-    angles = (f"{name} angle (rad)" for name in names)
-    return (*angles, *between, *(f"{name} rate (rad/s)" for name in names))
-
-
-_NAMES: dict[str, tuple[str, ...]] = {
-    "cartpole-swingup": (
-        "cart position (m)", "cart velocity (m/s)", "cos θ", "sin θ", "pole rate (rad/s)",
-    ),
-    "pendulum": ("cos θ", "sin θ", "angular velocity (rad/s)"),
-    "hopper": (
-        "height (m)", "torso pitch (rad)", *_joints(_HOPPER, *_PLANAR), "average x velocity (m/s)",
-    ),
-    "slim-humanoid": ("height (m)", *_QUATERNION, *_joints(_HUMANOID, *_LINEAR, *_ANGULAR)),
-    "half-cheetah": (
-        "average x velocity (m/s)", "height (m)", "torso pitch (rad)", *_joints(_CHEETAH, *_PLANAR),
-    ),
-    "crippled-ant": (
-        "x (m)", "y (m)", "height (m)", *_QUATERNION, *_joints(_ANT, *_LINEAR, *_ANGULAR),
-        *(f"torso rotation ({row}, {column})" for row in range(3) for column in range(3)),
-        "torso x (m)", "torso y (m)", "torso z (m)",
-    ),
-}  # fmt: skip
-
-
-def obs_names(env: str, obs_size: int) -> tuple[str, ...]:
-    """Name each number of an observation; plain numbering where the names are not known.
-
-    Args:
-        env: Short name of the environment.
-        obs_size: Width of its observations; Hopper's last number is an option.
-    """
-    names = _NAMES.get(env, ())
-    if obs_size == len(names) or (env == "hopper" and obs_size == len(names) - 1):
-        return names[:obs_size]
-    return tuple(f"observation[{index}]" for index in range(obs_size))
-
 
 def plot_dynamics(env: str, out: str | Path, *, num_states: int = 100, seed: int = 0) -> Path:
     """Draw what a trajectory's actions lead to under each training physics.
@@ -94,7 +42,8 @@ def plot_dynamics(env: str, out: str | Path, *, num_states: int = 100, seed: int
     changes = collect_changes(spec, physics, num_states, seed)
     default, varied = changes[0], changes[1:]
     first, second = choose_views(varied)
-    names = [f"change of {name}" for name in obs_names(spec.name, default.shape[-1])]
+    numbered = (f"observation[{i}]" for i in range(len(spec.obs_names), default.shape[-1]))
+    names = [f"change of {name}" for name in (*spec.obs_names, *numbered)]
     caption = (
         f"{spec.name}, {len(default)} states of one trajectory of uniformly random actions under"
         f" the default physics, seed {seed}. Every state is drawn once per physics, with the same"

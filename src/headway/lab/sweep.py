@@ -161,7 +161,15 @@ class Comparison:
     def folder(self) -> Path:
         """Where they go: over those of a comparison that this one contains, beside others."""
         facts, usual = self.facts, self.usual_folder
-        before = json.loads((usual / NOTE).read_text()) if (usual / NOTE).exists() else facts
+        before = facts
+        if (usual / NOTE).exists():
+            try:
+                before = dict(json.loads((usual / NOTE).read_bytes()))
+            except (ValueError, TypeError, RecursionError) as error:
+                raise RunError(
+                    f"{usual / NOTE} is damaged ({error}), expected what its folder compares; move"
+                    " the folder away, or choose another --out."
+                ) from None
         for name, value in facts.items():
             old = before.get(name, [None])
             if old != value and not (name in GROWING and all(one in value for one in old)):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from headway.errors import RunError
 from headway.lab.comparison import find, reproduce, spread, table_rows, verdicts
 from headway.lab.paper import Arm, Experiment, experiment
 from headway.lab.sweep import Comparison, Workers
@@ -150,6 +151,10 @@ def test_a_comparison_replaces_what_it_contains_and_nothing_else(tmp_path):
     assert (usual / "fig13.csv").read_bytes() == both
     (usual / "comparison.json").write_text("{}")
     assert make(seeds=(0, 1), envs=("pendulum", "hopper")) != usual
+    for damaged in ("{", "[1]"):
+        (usual / "comparison.json").write_text(damaged)
+        with pytest.raises(RunError, match=r"comparison\.json is damaged"):
+            make()
 
 
 def test_nothing_finished_makes_no_figure_but_a_table(training, tmp_path):
