@@ -15,8 +15,7 @@ from headway import task
 from headway.cli import main
 from headway.config import MODELS, OwnModelConfig, setting_names
 from headway.errors import ConfigError
-from headway.experiment import learners
-from headway.training import methods
+from headway.training import learners, methods
 from headway.training.loading import load_agent
 from headway.training.run import RunDir
 
@@ -177,7 +176,7 @@ def ridge(tmp_path_factory):
     names: dict = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(methods, "METHODS", dict(methods.METHODS))
-        patch.setattr(learners, "_LEARNERS", dict(learners._LEARNERS))
+        patch.setattr(learners, "LEARNERS", dict(learners.LEARNERS))
         patch.setitem(MODELS, "ridge", OwnModelConfig)
         patch.chdir(tmp_path_factory.mktemp("methods"))
         exec(compile(code.replace('"quick"', '"smoke"'), "methods.md", "exec"), names)

@@ -17,10 +17,6 @@ from .errors import LimitError as LimitError
 from .errors import PlanningError as PlanningError
 from .errors import RunError as RunError
 from .errors import UnknownNameError as UnknownNameError
-from .experiment.learners import Fit as Fit
-from .experiment.learners import Learned as Learned
-from .experiment.learners import Learner as Learner
-from .experiment.learners import register_learner as register_learner
 from .lab.diagnose import Diagnosis as Diagnosis
 from .lab.diagnose import diagnose as diagnose
 from .lab.dynamics import plot_dynamics as plot_dynamics
@@ -41,6 +37,10 @@ from .task import EnvSpec as EnvSpec
 from .task import Task as Task
 from .task import env_spec as env_spec
 from .task import register as register
+from .training.learners import Fit as Fit
+from .training.learners import Learned as Learned
+from .training.learners import Learner as Learner
+from .training.learners import register_learner as register_learner
 from .training.methods import METHODS as METHODS
 from .training.methods import PRESETS as PRESETS
 from .training.methods import Method as Method

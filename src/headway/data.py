@@ -23,13 +23,13 @@ class Trajectory:
     obs: Float[np.ndarray, "time_plus_1 obs"]
     """As the environment returned them, the last one included."""
     action: Float[np.ndarray, "time action"]
-    """What led from each observation to the next."""
+    """Actions that led from each observation to the next."""
     reward: Float[np.ndarray, " time"]
-    """What the environment paid for it."""
+    """Reward that the environment paid for each action."""
     sim_params: Mapping[str, float]
     """The physics of the episode."""
     terminated: bool = False
-    """Whether the episode ended for good, and not because its time was up."""
+    """The episode ended for good, and not because its time was up."""
 
     def __post_init__(self):
         steps = len(self.action)
@@ -80,7 +80,7 @@ class History(NamedTuple):
 
 
 def history_slots(step: Any, length: int, xp: Any) -> tuple[Any, Any]:
-    """Which step each slot of a history holds, and whether the slot is used.
+    """Step that each slot of a history holds, and a mask of the slots that are used.
 
     Args:
         step: Steps whose past is wanted, with a trailing axis of 1.
@@ -173,7 +173,7 @@ class Episodes(eqx.Module):
 
 
 class Samples(NamedTuple):
-    """Which transitions a model learns from: the context of `anchor` predicts `anchor + offset`."""
+    """Transitions that a model learns from: the context of `anchor` predicts `anchor + offset`."""
 
     episode: Int[Array, " sample"]
     anchor: Int[Array, " sample"]

@@ -10,11 +10,11 @@ import headway
 import runs
 from headway.data import Trajectory
 from headway.errors import ConfigError, DivergenceError, PlanningError, UnknownNameError
-from headway.experiment.learners import Learned
 from headway.models.fitting import EpochStats
 from headway.task import env_names
 from headway.training import loading, train
 from headway.training.collect import Environments
+from headway.training.learners import Learned, make_learner
 from headway.training.methods import make_config
 from headway.training.run import RunDir
 
@@ -216,7 +216,7 @@ def test_what_diverges_for_good_stops_with_all_that_was_good(reference, tmp_path
 def fresh_model():
     config = runs.tiny_config(**{"fitting.weight_decay": 0.0})
     task = loading.load_task(config)
-    return loading.learner_of(config, task), loading.initial(config, task)
+    return make_learner(config, task), loading.initial(config, task)
 
 
 def with_bias(learned, at, value):

@@ -1,1 +1,1 @@
-"""What is learned: networks, losses, fitting."""
+"""Dynamics models: networks, losses, fitting, and beliefs while acting."""

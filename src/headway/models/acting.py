@@ -35,7 +35,7 @@ Context = Float[Array, "member env context"] | None
 
 
 class MultiHeadBelief(NamedTuple):
-    """What multi-headed networks know of each environment."""
+    """Belief of multi-headed networks about each environment."""
 
     recent: RecentTransitions
     context: Context
@@ -54,10 +54,10 @@ class MultiHeadModel(Model):
     statistics: Statistics
     task: Task
     planner: PlannerConfig = eqx.field(static=True)
-    """How heads are chosen, and whether they keep learning."""
+    """Settings of head selection and of heads that keep learning."""
     history_length: int = eqx.field(static=True)
     prior: Prior | None = None
-    """Where heads that keep learning start; `fit_prior` finds it."""
+    """Start of heads that keep learning; `fit_prior` finds it."""
 
     def __check_init__(self):
         if self.planner.adaptation != "none" and self.prior is None:
@@ -122,7 +122,7 @@ class MultiHeadModel(Model):
     def context(
         self, recent: RecentTransitions, sim_params: Float[Array, "env sim_param"] | None = None
     ) -> Context:
-        """What each member makes of the recent past; None where networks see no context."""
+        """Context of each member from the recent past; None where networks see no context."""
         members = self.net.num_members
         history, sim_params = jax.tree.map(
             lambda x: jnp.broadcast_to(x, (members, *x.shape)),
@@ -220,7 +220,7 @@ def select_heads(
 
 
 class OwnHeads(NamedTuple):
-    """What a plan has of each environment's own: its heads, and the context in a hidden layer.
+    """Weights of a plan that differ by environment: its heads, and the context in a hidden layer.
 
     Means and log-variances come out of one product: the layer's outputs are the mean delta in
     raw units (averaged over the choices), then each choice's log-variance.
@@ -261,7 +261,7 @@ class FoldedDynamics(Dynamics):
 
     @property
     def stochastic(self) -> bool:
-        """Whether deltas have a variance."""
+        """True where deltas have a variance."""
         return self.own.min_logvar is not None
 
     def of_member(self, member: Int[Array, ""]) -> "FoldedDynamics":

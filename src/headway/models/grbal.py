@@ -268,6 +268,6 @@ def next_obs(
     obs: Float[Array, "1 obs particle candidate"],
     normalized: Float[Array, "1 obs particle candidate"],
 ) -> Float[Array, "1 obs particle candidate"]:
-    """Where a predicted, normalised `delta` leads, in the layout of a plan."""
+    """Next observation after a predicted, normalised `delta`, in the layout of a plan."""
     delta = over_rows(statistics.delta.denormalize)(normalized)
     return over_rows(task.postprocess)(obs, delta)

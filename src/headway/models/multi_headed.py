@@ -104,7 +104,7 @@ class MultiHeadDynamics(eqx.Module):
     relation_head: Dense | None = None
     """Tells from two contexts, one after the other, whether they are of one trajectory."""
     context_kind: ContextKind = eqx.field(static=True, default="learned")
-    """What the networks are told of the hidden physics."""
+    """Source of the networks' knowledge of the hidden physics."""
     sim_param_names: tuple[str, ...] = eqx.field(static=True, default=())
     """The true simulator parameters that are its context, in their order; mostly none."""
 
@@ -184,7 +184,7 @@ class MultiHeadDynamics(eqx.Module):
         statistics: Statistics,
         sim_params: Float[Array, "member batch sim_param"] | None = None,
     ) -> Float[Array, "member batch context"] | None:
-        """What the networks are told of the hidden physics; None where it is nothing.
+        """Context vector of the hidden physics; None where networks are told nothing.
 
         Args:
             history: Past transitions, [member, batch, K, ...].
@@ -235,7 +235,7 @@ class MultiHeadDynamics(eqx.Module):
 def flat_history(
     history: History, statistics: Statistics
 ) -> Float[Array, "member batch K_times_obs_and_action"]:
-    """What enters a context encoder; state differences are not normalised (released code)."""
+    """Input of a context encoder; state differences are not normalised (released code)."""
     members, batch = history.action.shape[:2]
     action = statistics.history_action.normalize(history.action)
     flat = [history.obs_diff.reshape(members, batch, -1), action.reshape(members, batch, -1)]
@@ -248,6 +248,6 @@ def network_input(
     obs: Float[Array, "*batch obs"],
     action: Float[Array, "*batch action"],
 ) -> Float[Array, "*batch in"]:
-    """What enters a backbone: normalised features, then the normalised action."""
+    """Input of a backbone: normalised features, then the normalised action."""
     features = statistics.features.normalize(task.preprocess(obs))
     return jnp.concatenate([features, statistics.action.normalize(action)], axis=-1)

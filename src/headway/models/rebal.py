@@ -24,7 +24,7 @@ FORGET_BIAS = 1.0
 
 
 class CellState(NamedTuple):
-    """What one layer remembers."""
+    """Recurrent state of one layer."""
 
     hidden: Float[Array, "*batch size"]
     cell: Float[Array, "*batch size"]

@@ -26,7 +26,7 @@ from headway.task import Task
 
 
 class RelationParts(eqx.Module):
-    """What the relation loss teaches."""
+    """Weights that the relation loss trains."""
 
     encoder: ContextEncoder
     head: Dense
@@ -60,7 +60,7 @@ def intervention_distance(
     weight: Float[Array, "member state"],
     context: Float[Array, "member sample context"],
 ) -> Float[Array, "member sample sample"]:
-    """How differently two contexts make a network predict the same states and actions.
+    """Distance of two contexts by what a network predicts of the same states and actions.
 
     The absolute difference of the predicted means, averaged over states and dimensions. The
     layer that the context joins is linear in it, so its product is done once per state and once
@@ -101,7 +101,7 @@ def intervention_distance(
 def similarity(
     distance: Float[Array, "member sample sample"], pairs: Pairs, temperature: float
 ) -> Float[Array, "member sample sample"]:
-    """How much two contexts count as the same, from 0 to 1, by what they predict.
+    """Similarity of two contexts, from 0 to 1, by what they predict.
 
     `exp(-d / temperature)`, where `d` is the distance in units of its standard deviation over
     the pairs of a member.
@@ -199,7 +199,7 @@ def relation_gradient(
 
 
 def relation_parts(model: MultiHeadDynamics) -> RelationParts:
-    """What the relation loss teaches of a model that has a relation head."""
+    """Weights that the relation loss trains, of a model that has a relation head."""
     assert model.context_encoder is not None
     assert model.relation_head is not None
     return RelationParts(model.context_encoder, model.relation_head)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Physics(NamedTuple):
-    """Where environments of a classic world are, and under which physics."""
+    """States of environments of a classic world, and their physics."""
 
     state: Float[Array | np.ndarray, "*env state"]
     sim_params: Mapping[str, Float[Array | np.ndarray, "*env"]]

@@ -1,1 +1,1 @@
-"""How it acts: imagined returns, head selection, optimizers, the agent."""
+"""Acting: imagined returns, optimizers, the agent and its controller."""

@@ -29,9 +29,9 @@ class AgentState(NamedTuple):
     action: Float[Array, "env action"]
     """The last action, in [-1, 1]."""
     acted: Bool[Array, " env"]
-    """Where that action, taken at `obs`, led to what is observed next."""
+    """Environments in which that action, taken at `obs`, led to the next observation."""
     search: Any
-    """Where the last search ended, one step later (`Search`); None for a random agent."""
+    """The last search as it ended, one step later (`Search`); None for a random agent."""
     key: PRNGKeyArray
 
 

@@ -117,7 +117,7 @@ def candidate_returns(
 def follow(
     dynamics: Dynamics, obs: Float[Array, "env obs"], actions: Float[Array, "env horizon action"]
 ) -> Float[Array, "member env horizon obs"]:
-    """Where given actions lead, without noise; one rollout per member and environment.
+    """Observations along given actions, without noise; a rollout per member and environment.
 
     Args:
         dynamics: The model, specialised to its belief.

@@ -1,7 +1,4 @@
-"""Tables of what a model has learned: head shares per physics, error by imagined step."""
-
-from collections import defaultdict
-from typing import Any
+"""Error of imagined observations by step."""
 
 import equinox as eqx
 import jax
@@ -9,48 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from headway.data import Episodes, Trajectory, sim_params_row
+from headway.data import Trajectory, sim_params_row
 from headway.models.base import Keys, Model, RecentTransitions, live_through
-from headway.models.fitting import FitSetup, assign_segments
-from headway.models.multi_headed import MultiHeadDynamics, Statistics
 from headway.planning.agent import Agent
 from headway.planning.rollouts import follow
-from headway.training.run import format_sim_params
 
 NUM_STARTS = 256  # imagined rollouts per group in `prediction_error`
-
-
-def head_shares(
-    model: MultiHeadDynamics,
-    statistics: Statistics,
-    setup: FitSetup,
-    trajectories: list[Trajectory],
-    episodes: Episodes,
-) -> list[dict[str, Any]]:
-    """Share of the segments of each physics that each head of each member owns.
-
-    Args:
-        model: As trained so far.
-        statistics: Its normalisers.
-        setup: Task and settings of fitting.
-        trajectories: All data.
-        episodes: The same, laid out.
-
-    Returns:
-        Rows of `assignments.csv`, without the iteration.
-    """
-    heads = np.asarray(eqx.filter_jit(assign_segments)(model, setup, episodes, statistics).forward)
-    owned = defaultdict(lambda: np.zeros((model.num_members, model.num_heads)))
-    for row, trajectory in enumerate(trajectories):
-        used = -(-len(trajectory) // setup.segment_length)
-        for head in range(model.num_heads):
-            count = (heads[:, row, :used] == head).sum(-1)
-            owned[format_sim_params(trajectory.sim_params)][:, head] += count
-    return [
-        {"member": member, "head": head, "sim_params": physics, "share": float(share)}
-        for physics, counts in sorted(owned.items())
-        for (member, head), share in np.ndenumerate(counts / counts.sum(-1, keepdims=True))
-    ]
 
 
 def prediction_error(

@@ -4,10 +4,10 @@ import equinox as eqx
 import jax
 
 from headway.config import Config
-from headway.experiment.learners import Learned, Learner, make_learner
 from headway.planning.agent import Agent
-from headway.task import Task, env_options, env_spec, episode_length
+from headway.task import Task, env_options, env_spec
 from headway.training.collect import Environments
+from headway.training.learners import Learned, make_learner
 from headway.training.methods import check_options
 from headway.training.run import RunDir
 
@@ -18,15 +18,10 @@ def load_task(config: Config) -> Task:
     return env_spec(config.env).make_task(**env_options(config))
 
 
-def learner_of(config: Config, task: Task) -> Learner:
-    """The learner of a configuration."""
-    return make_learner(config, task, episode_length(config))
-
-
 def initial(config: Config, task: Task) -> Learned:
     """The untrained model that a seed begins with."""
     key = jax.random.fold_in(jax.random.key(config.seed), 0)
-    return learner_of(config, task).initial(key)
+    return make_learner(config, task).initial(key)
 
 
 def load_learned(run: RunDir, config: Config) -> Learned:
@@ -56,4 +51,4 @@ def load_agent(
     config = config or run.config()
     learned = load_learned(run, config)
     trajectories = run.load_data() if config.planner.adaptation != "none" else []
-    return learner_of(config, load_task(config)).agent(learned, environments, trajectories)
+    return make_learner(config, load_task(config)).agent(learned, environments, trajectories)

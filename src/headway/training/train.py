@@ -10,10 +10,9 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from headway.config import Config
+from headway.config import Config, override
 from headway.data import Trajectory
 from headway.errors import DivergenceError
-from headway.experiment.learners import Learned, make_learner
 from headway.models.fitting import EpochStats
 from headway.training.collect import (
     AgentPolicy,
@@ -26,6 +25,7 @@ from headway.training.collect import (
 )
 from headway.training.evaluate import Tests, evaluate_agent
 from headway.training.files import tree_arrays, tree_from_arrays
+from headway.training.learners import Learned, make_learner
 from headway.training.loading import initial, load_learned
 from headway.training.progress import Progress
 from headway.training.run import Partial, RunDir
@@ -121,8 +121,8 @@ class _Training:
     ):
         self.config, self.run, self.environments = config, run, environments
         self.progress, self.stop = progress, stop
-        self.learner = make_learner(config, environments.task, environments.episode_length)
-        self.data = run.load_data() if self.learner.learns else []
+        self.learner = make_learner(config, environments.task)
+        self.data = run.load_data() if config.model.learns else []
         begun = run.finished_iterations > 0
         self.learned = load_learned(run, config) if begun else initial(config, environments.task)
 
@@ -135,7 +135,7 @@ class _Training:
             metrics: dict[str, Any] = {"iteration": iteration}
             collected: list[Trajectory] = []
             seconds = {}
-            if learner.learns:
+            if config.model.learns:
                 rollout = self.collect(iteration, keys.collect, partial)
                 collected, seconds["collect"] = rollout.trajectories, rollout.seconds
                 self.data += collected
@@ -253,7 +253,9 @@ class _Training:
 
         while True:
             if rollbacks:
-                learner = self.learner.slower(SLOWER**rollbacks)
+                rate = max(1e-12, SLOWER**rollbacks * self.config.fitting.learning_rate)
+                slower = override(self.config, {"fitting.learning_rate": rate})
+                learner = make_learner(slower, self.environments.task)
             fit = learner.fit(self.data, iteration, key)
             for fitted, stats in fit.epochs(state, len(history)):
                 problem = divergence(stats, history)

@@ -51,7 +51,7 @@ class Optimizer(eqx.Module):
     num_kept = 0
     """Elites that compete once more."""
     unrolled: ClassVar[bool] = False
-    """Whether iterations differ in shape, so that each is compiled by itself."""
+    """Iterations differ in shape, so that each is compiled by itself."""
 
     @property
     def max_evaluations(self) -> int:

@@ -13,7 +13,8 @@ from headway.models.simulator import ClassicSimulator, RobotSimulator
 from headway.planning.rollouts import candidate_returns
 from headway.task import env_action, env_names, env_spec
 from headway.training.collect import Environments
-from headway.training.loading import initial, learner_of
+from headway.training.learners import make_learner
+from headway.training.loading import initial
 from headway.training.methods import make_config
 
 CLASSIC = ["pendulum", "cartpole-swingup"]
@@ -74,7 +75,7 @@ def test_compiled_equations_step_as_the_environment_under_every_physics(env):
 
 
 def agent_of(config, environments):
-    learner = learner_of(config, environments.task)
+    learner = make_learner(config, environments.task)
     return learner.agent(initial(config, environments.task), environments)
 
 
@@ -101,7 +102,7 @@ def test_imagined_returns_of_the_equations_are_what_the_environment_pays(env):
 
 def test_a_step_plans_from_where_the_environments_are_now():
     config, environments = begin("pendulum", every_physics("pendulum")[:2])
-    agent = learner_of(config, environments.task).agent(
+    agent = make_learner(config, environments.task).agent(
         initial(config, environments.task), environments
     )
     state = agent.init(2, key=jax.random.key(0))

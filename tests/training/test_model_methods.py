@@ -10,6 +10,7 @@ import headway.envs
 from headway.data import Trajectory
 from headway.models.multi_headed import network_input
 from headway.training import loading, train
+from headway.training.learners import make_learner
 from headway.training.methods import make_config, told_sim_params
 
 NEW = ("stacked", "cadm", "pets-cadm", "oracle-params", "ria")
@@ -74,7 +75,7 @@ def fitted_error(method):
         },
     )
     task = loading.load_task(config)
-    learner, learned = loading.learner_of(config, task), loading.initial(config, task)
+    learner, learned = make_learner(config, task), loading.initial(config, task)
     fit = learner.fit(masses(40), 0, jax.random.key(0))
     *_, (state, _) = fit.epochs(learned.fit, 0)
     statistics = fit.statistics

@@ -4,6 +4,7 @@ import numpy as np
 
 import headway
 from headway.training import loading
+from headway.training.learners import make_learner
 from headway.training.methods import config_to_evaluate
 from headway.training.run import RunDir
 
@@ -26,7 +27,7 @@ def test_the_prior_of_a_loaded_agent_comes_from_all_its_data(two_iterations):
     agent = loading.load_agent(run, config)
     assert agent.model.prior.root.shape[0] == agent.model.net.num_members
     learned, task = loading.load_learned(run, config), loading.load_task(config)
-    learner = loading.learner_of(config, task)
+    learner = make_learner(config, task)
     part = learner.agent(learned, trajectories=run.load_data()[:1])
     assert (part.model.prior.noise != agent.model.prior.noise).all()
     assert loading.load_agent(run).model.prior is None

@@ -1,1 +1,0 @@
-"""How it is measured: methods, rollouts, learners, evaluation, training."""
