@@ -97,37 +97,23 @@ def diagnose(
             f"{run.path} is a run of {config.method}, which has no prediction heads, allowed:"
             " methods with a multi-headed model, such as tmcl."
         )
-    kept = run.tests() if num_episodes is None and not collected else {}
+    trajectories: Mapping[str, list[Trajectory]] = {}
     if collected:
         if groups or num_episodes is not None:
             raise ConfigError(
                 "groups or episodes are chosen together with `collected`, allowed: one of them; the"
                 " collected episodes are all of training physics."
             )
-        return examined(run, config, {COLLECTED: run.iteration_data(run.last_iteration)})
-    if kept:
+        trajectories = {COLLECTED: run.iteration_data(run.last_iteration)}
+    elif num_episodes is None and (kept := run.tests()):
         wanted = known_groups(groups, sim_param_sets(config).group_names)
         if kept.keys() >= set(wanted):
-            return examined(run, config, {group: kept[group] for group in wanted})
-    tested = run_tests(
-        run_dir, groups=groups, num_episodes=num_episodes, settings=settings, progress=progress
-    )
-    return examined(run, tested.config, tested.tests.trajectories)
-
-
-def examined(
-    run: RunDir, config: Config, trajectories: Mapping[str, list[Trajectory]]
-) -> Diagnosis:
-    """Examine what a run's heads predict of some episodes, and how they are selected.
-
-    Args:
-        run: The run, of a method with prediction heads.
-        config: Its settings, with those of the planner perhaps changed.
-        trajectories: Episodes of its environment, by group.
-
-    Raises:
-        RunError: There is no trained run, or it is damaged.
-    """
+            trajectories = {group: kept[group] for group in wanted}
+    if not trajectories:
+        tested = run_tests(
+            run_dir, groups=groups, num_episodes=num_episodes, settings=settings, progress=progress
+        )
+        config, trajectories = tested.config, tested.tests.trajectories
     agent = load_agent(run, config)
     assert isinstance(agent.model, MultiHeadModel)
     key = jax.random.key(config.evaluation.seed)

@@ -431,12 +431,6 @@ def head_shares(axes: Axes, table: pd.DataFrame) -> None:
     axes.set_ylabel(axis_label(names))
 
 
-def head_looks(table: pd.DataFrame) -> dict[str, dict[str, Any]]:
-    """Looks of heads, for a legend."""
-    heads = sorted(table["head"].unique())
-    return {f"head {h}": {"color": HEADS[h % len(HEADS)], "marker": "patch"} for h in heads}
-
-
 def _learning_curve(axes: Axes, table: pd.DataFrame, looks: Looks) -> None:
     """Draw one run's mean return by group, with one standard deviation over episodes."""
     for group, own in table.groupby("group", sort=False):
@@ -518,7 +512,9 @@ def save_run_figures(run_dir: str | Path) -> list[Path]:
         size = (max(1.3 * found.assignments.member.nunique() + 0.6, 5.6), 0.9 + 0.3 * rows)
         with drawn("head_shares", "Best head of each physics", caption, size) as drawing:
             head_shares(drawing.subplots(), found.assignments)
-            legend(drawing, head_looks(found.assignments))
+            heads = {h: HEADS[h % len(HEADS)] for h in sorted(found.assignments["head"].unique())}
+            patches = {f"head {h}": {"color": c, "marker": "patch"} for h, c in heads.items()}
+            legend(drawing, patches)
     if len(found.errors):
         caption = (
             f", iteration {found.errors.iteration.max() + 1}. Root mean squared error of imagined"

@@ -32,7 +32,7 @@ class Arm:
     method: str = "tmcl"
     """A name of the table of methods."""
     settings: Settings = dataclasses.field(default_factory=dict)
-    """What differs from the method, by dotted name."""
+    """Changes of the method, by dotted name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,9 +42,9 @@ class Experiment:
     name: str
     """As the command line takes it."""
     title: str
-    """What is compared."""
+    """A few words for headings."""
     arms: tuple[Arm, ...]
-    """What is compared, in the order of the figure."""
+    """In the order of the figure."""
     reference: str = ""
     """Label of the arm that the others are compared with; the first one by default."""
     measure: Measure = "unseen"

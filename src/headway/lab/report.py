@@ -75,9 +75,9 @@ class Page:
         """Environments of the compared runs."""
         return sorted(self.compared.env.unique())
 
-    def per_env(self, make: Callable[[str], Block]) -> list[Block]:
+    def per_env(self, make: Callable[["Page", str], Block]) -> list[Block]:
         """A block for every environment."""
-        return [{"title": env, **make(env)} for env in self.envs]
+        return [{"title": env, **make(self, env)} for env in self.envs]
 
     def of_env(self, table: pd.DataFrame, env: str) -> pd.DataFrame:
         """Rows of compared runs in one environment."""
@@ -114,11 +114,24 @@ def write_report(runs: Sequence[str | Path], out: str | Path = "report.html") ->
     if not runs:
         raise ConfigError("no run is given, allowed: one or more run directories.")
     page = Page.of(tables.read_runs(runs))
-    chapters = (
-        _results, _curves, _physics, _improvement, _head_shares, _prediction_error, _settings,
-        _times, _runs, _numbers,
-    )  # fmt: skip
-    sections = [chapter(page) for chapter in chapters]
+    members = page.found.assignments
+    heads = 1 + int(members["head"].max()) if len(members) else 1
+    sections = [
+        {"name": "results", "blocks": _results(page)},
+        {"name": "learning-curves", "blocks": page.per_env(_curves)},
+        {"name": "physics", "blocks": page.per_env(_physics)},
+        {"name": "improvement", "blocks": [_improvement(page)]},
+        {
+            "name": "head-shares",
+            "legend": [f"head {head}" for head in range(min(heads, len(figures.HEADS)))],
+            "blocks": page.per_env(_head_shares),
+        },
+        {"name": "prediction-error", "blocks": page.per_env(_prediction_error)},
+        {"name": "settings", "blocks": page.per_env(_settings)},
+        {"name": "times", "blocks": page.per_env(_times)},
+        {"name": "runs", "blocks": [_runs(page)]},
+        {"name": "numbers", "blocks": [_numbers(page)]},
+    ]
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("headway", "lab"),
         autoescape=True,
@@ -126,6 +139,18 @@ def write_report(runs: Sequence[str | Path], out: str | Path = "report.html") ->
         trim_blocks=True,
         lstrip_blocks=True,
     )  # fmt: skip
+
+    def symbol(label: str) -> Callable[[Axes], None]:
+        """A piece of line with one marker."""
+
+        def draw(axes: Axes) -> None:
+            look = {**page.looks[label], "gid": None, "markersize": 5, "markevery": [1]}
+            axes.plot([0, 1, 2], [0, 0, 0], **look)
+            axes.set_axis_off()
+            axes.margins(0.02, 0.5)
+
+        return draw
+
     labels = list(page.looks)
     title = " and ".join(filter(None, [", ".join(labels[:-1]), labels[-1]]))
     text = environment.get_template("report.html.jinja").render(
@@ -133,7 +158,7 @@ def write_report(runs: Sequence[str | Path], out: str | Path = "report.html") ->
         envs=page.envs,
         count=len(page.compared),
         labels=labels,
-        symbols=[_symbol(page, look) for look in page.looks.values()],
+        symbols=[page.panel("", symbol(i), "", size=(0.42, 0.16))["svg"] for i in labels],
         notes=page.found.notes,
         sections=sections,
         theme=figures.THEME,
@@ -144,17 +169,6 @@ def write_report(runs: Sequence[str | Path], out: str | Path = "report.html") ->
     )
     write_bytes(Path(out), text.encode())
     return Path(out)
-
-
-def _symbol(page: Page, look: dict[str, Any]) -> str:
-    """A piece of line with one marker."""
-
-    def draw(axes: Axes) -> None:
-        axes.plot([0, 1, 2], [0, 0, 0], **{**look, "gid": None}, markersize=5, markevery=[1])
-        axes.set_axis_off()
-        axes.margins(0.02, 0.5)
-
-    return page.panel("", draw, "", size=(0.42, 0.16))["svg"]
 
 
 def _cell(text: str, *below: str, kind: str = "text") -> Cell:
@@ -191,39 +205,40 @@ def _unlike(page: Page, env: str | None = None) -> list[str]:
     return [f"{text}{'; '.join(found)}."] if found else []
 
 
-def _results(page: Page) -> Block:
-    def of_env(env: str) -> Block:
-        own = page.of_env(page.parts, env)
-        if own.empty:
-            return {"texts": ["No run is finished yet."]}
-        groups = sorted(own.group.unique(), key=lambda group: group != TRAIN)
-        form = "{:.2f}" if env in page.scored else "{:,.1f}"
-        lines = []
-        for label in page.looks:
-            if label not in set(own.label):
-                continue
-            values = _matrix(own, label, "value").reindex(columns=groups)
-            returns = _matrix(own, label, "return_mean").reindex(columns=groups)
-            cells = []
-            for group in groups:
-                column, below = values[[group]].dropna().to_numpy(), ""
-                if env in page.scored and len(column):
-                    below = f"return {_number(returns[group].mean(), '{:,.0f}')}"
-                    below += f" ± {returns[group].std():,.0f}" if len(column) > 1 else ""
-                cells.append(
-                    _estimate(statistics.estimate([column]) if len(column) else None, form, below)
-                )
-            seeds = f"{len(values)} seed{'s' * (len(values) != 1)}"
-            lines.append(page.line(label, *cells, below=seeds))
-        references = page.found.runs[page.found.runs.is_reference & (page.found.runs.env == env)]
-        texts = ["Returns: no references are known for all of these physics."]
-        if env in page.scored:
-            own_runs = set(references.method) == set(tables.REFERENCES)
-            by = "the runs of random and true-dynamics given here"
-            texts = [f"Scores are normalised by {by if own_runs else 'the reference returns'}."]
-        columns = ["method", *map(group_label, groups)]
-        return {"table": {"columns": columns, "lines": lines}, "texts": texts + _unlike(page, env)}
+def _results_of(page: Page, env: str) -> Block:
+    own = page.of_env(page.parts, env)
+    if own.empty:
+        return {"texts": ["No run is finished yet."]}
+    groups = sorted(own.group.unique(), key=lambda group: group != TRAIN)
+    form = "{:.2f}" if env in page.scored else "{:,.1f}"
+    lines = []
+    for label in page.looks:
+        if label not in set(own.label):
+            continue
+        values = _matrix(own, label, "value").reindex(columns=groups)
+        returns = _matrix(own, label, "return_mean").reindex(columns=groups)
+        cells = []
+        for group in groups:
+            column, below = values[[group]].dropna().to_numpy(), ""
+            if env in page.scored and len(column):
+                below = f"return {_number(returns[group].mean(), '{:,.0f}')}"
+                below += f" ± {returns[group].std():,.0f}" if len(column) > 1 else ""
+            cells.append(
+                _estimate(statistics.estimate([column]) if len(column) else None, form, below)
+            )
+        seeds = f"{len(values)} seed{'s' * (len(values) != 1)}"
+        lines.append(page.line(label, *cells, below=seeds))
+    references = page.found.runs[page.found.runs.is_reference & (page.found.runs.env == env)]
+    texts = ["Returns: no references are known for all of these physics."]
+    if env in page.scored:
+        own_runs = set(references.method) == set(tables.REFERENCES)
+        by = "the runs of random and true-dynamics given here"
+        texts = [f"Scores are normalised by {by if own_runs else 'the reference returns'}."]
+    columns = ["method", *map(group_label, groups)]
+    return {"table": {"columns": columns, "lines": lines}, "texts": texts + _unlike(page, env)}
 
+
+def _results(page: Page) -> list[Block]:
     blocks = []
     if len(page.envs) > 1 and set(page.envs) == set(page.scored):
         unseen, lines = page.parts[page.parts.group != TRAIN], []
@@ -248,91 +263,61 @@ def _results(page: Page) -> Block:
         " for them, and no difference is claimed."
     ]
     narrow = [statistics.caution(min(counts))] if len(counts) else []
-    return {
-        "name": "results",
-        "title": "Results",
-        "lead": "After the last iteration. Scores are 0 for random actions and 1 for a planner on"
-        " the true dynamics; they are interquartile means over seeds with 95 % bootstrap"
-        " intervals. Returns are means ± standard deviations over seeds. Every physics of a group"
-        " counts once.",
-        "blocks": [*blocks, *page.per_env(of_env), {"texts": texts * bool(few) + narrow}],
-    }
+    return [*blocks, *page.per_env(_results_of), {"texts": texts * bool(few) + narrow}]
 
 
-def _curves(page: Page) -> Block:
-    def of_env(env: str) -> Block:
-        own = page.of_env(page.found.curves, env)
-        own = own.assign(finished=own["run"].isin(page.found.finished))
-        references = page.found.final
-        is_reference = page.found.runs.loc[page.found.runs.is_reference, "run"]
-        levels = tables.by_group(references[references["run"].isin(is_reference)])
-        panels, once = [], []
-        for group, table in own.groupby("group", sort=False):
-            if not table.duplicated("run").any():
-                once.append(group_label(str(group)))
-                continue
-            here = levels[(levels.env == env) & (levels.group == group)]
+def _curves(page: Page, env: str) -> Block:
+    own = page.of_env(page.found.curves, env)
+    own = own.assign(finished=own["run"].isin(page.found.finished))
+    references = page.found.final
+    is_reference = page.found.runs.loc[page.found.runs.is_reference, "run"]
+    levels = tables.by_group(references[references["run"].isin(is_reference)])
+    panels, once = [], []
+    for group, table in own.groupby("group", sort=False):
+        if not table.duplicated("run").any():
+            once.append(group_label(str(group)))
+            continue
+        here = levels[(levels.env == env) & (levels.group == group)]
 
-            def draw(axes: Axes, table: pd.DataFrame = table, here: pd.DataFrame = here) -> None:
-                figures.curves(axes, table, page.looks)
-                for method, level in here.groupby("method").return_mean.mean().items():
-                    style = {"color": figures.FAINT, "fontsize": 7, "ha": "right", "va": "bottom"}
-                    axes.axhline(level, color=figures.FAINT, linewidth=1, linestyle=":")
-                    axes.text(
-                        0.995, level, str(method), transform=axes.get_yaxis_transform(), **style
-                    )
+        def draw(axes: Axes, table: pd.DataFrame = table, here: pd.DataFrame = here) -> None:
+            figures.curves(axes, table, page.looks)
+            for method, level in here.groupby("method").return_mean.mean().items():
+                style = {"color": figures.FAINT, "fontsize": 7, "ha": "right", "va": "bottom"}
+                axes.axhline(level, color=figures.FAINT, linewidth=1, linestyle=":")
+                axes.text(0.995, level, str(method), transform=axes.get_yaxis_transform(), **style)
 
-            label = f"Return over environment steps on {env}, {group}"
-            panels.append((group != COLLECTED, page.panel(group_label(str(group)), draw, label)))
-        panels.sort(key=lambda found: found[0])
-        texts = [f"Measured after one iteration at most, so no curve: {'; '.join(once)}."]
-        return {"panels": [panel for _, panel in panels], "texts": texts * bool(once)}
-
-    return {
-        "name": "learning-curves",
-        "title": "Learning curves",
-        "lead": "Lines are means over seeds. Bands are 95 % bootstrap intervals of the mean; with"
-        " fewer than three seeds each seed has a thin line instead. Dotted thin lines are"
-        " unfinished runs. Every test episode counts once. The first iteration acts at random.",
-        "blocks": page.per_env(of_env),
-    }
+        label = f"Return over environment steps on {env}, {group}"
+        panels.append((group != COLLECTED, page.panel(group_label(str(group)), draw, label)))
+    panels.sort(key=lambda found: found[0])
+    texts = [f"Measured after one iteration at most, so no curve: {'; '.join(once)}."]
+    return {"panels": [panel for _, panel in panels], "texts": texts * bool(once)}
 
 
-def _physics(page: Page) -> Block:
-    def of_env(env: str) -> Block:
-        own = page.of_env(page.parts, env)
-        if own.empty:
-            return {"texts": ["No run is finished yet."]}
-        name = "score" if env in page.scored else "return per episode"
-        shown = {label: look for label, look in page.looks.items() if label in set(own.label)}
-        label = f"{name} by physics on {env}"
-        physics = page.panel(
-            f"{name} by physics",
-            lambda axes: figures.by_physics(axes, own, shown, name, joined=True),
-            label,
-            size=(3.5, 2.9),
-        )
-        panels = [physics]
-        for group in sorted(own.group.unique(), key=lambda group: group != TRAIN):
-            values = own[own.group == group].groupby(["label", "run"]).value.mean().reset_index()
-            panels.append(
-                page.panel(
-                    group_label(group),
-                    lambda axes, values=values: figures.dots(axes, values, shown, name),
-                    f"{name} of each method on {env}, {group}",
-                    size=(3.5, 0.85 + 0.25 * len(shown)),
-                )
+def _physics(page: Page, env: str) -> Block:
+    own = page.of_env(page.parts, env)
+    if own.empty:
+        return {"texts": ["No run is finished yet."]}
+    name = "score" if env in page.scored else "return per episode"
+    shown = {label: look for label, look in page.looks.items() if label in set(own.label)}
+    label = f"{name} by physics on {env}"
+    physics = page.panel(
+        f"{name} by physics",
+        lambda axes: figures.by_physics(axes, own, shown, name, joined=True),
+        label,
+        size=(3.5, 2.9),
+    )
+    panels = [physics]
+    for group in sorted(own.group.unique(), key=lambda group: group != TRAIN):
+        values = own[own.group == group].groupby(["label", "run"]).value.mean().reset_index()
+        panels.append(
+            page.panel(
+                group_label(group),
+                lambda axes, values=values: figures.dots(axes, values, shown, name),
+                f"{name} of each method on {env}, {group}",
+                size=(3.5, 0.85 + 0.25 * len(shown)),
             )
-        return {"panels": panels}
-
-    return {
-        "name": "physics",
-        "title": "Training and unseen physics",
-        "lead": "After the last iteration. First the mean over seeds for every physics, unseen ones"
-        " on a grey ground; then for every group a dot per seed, their mean, and its 95 %"
-        " bootstrap interval where there are three seeds or more.",
-        "blocks": page.per_env(of_env),
-    }
+        )
+    return {"panels": panels}
 
 
 def _improvement(page: Page) -> Block:
@@ -362,123 +347,69 @@ def _improvement(page: Page) -> Block:
         one = "There is one method only: nothing to compare."
         none = "No two methods were tested on the same unseen physics."
         block = {"texts": [one if len(labels) == 1 else none]}
-    return {
-        "name": "improvement",
-        "title": "Probability of improvement",
-        "lead": "Probability that a run of the method in the row beats a run of the method in the"
-        " column on unseen physics, averaged over the environments and groups that both were"
-        " tested on; 0.5 means no difference. Below it the 95 % bootstrap interval.",
-        "blocks": [{**block, "texts": block["texts"] + _unlike(page)}],
-    }
+    return {**block, "texts": block["texts"] + _unlike(page)}
 
 
-def _head_shares(page: Page) -> Block:
-    def of_env(env: str) -> Block:
-        panels = []
-        for _, own in page.of_env(page.found.assignments, env).groupby("run", sort=False):
-            if own["head"].nunique() > 1:
-                title = f"{own.label.iloc[0]}, seed {own.seed.iloc[0]}"
-                panels.append(
-                    page.panel(
-                        title,
-                        lambda axes, own=own: figures.head_shares(axes, own),
-                        f"Head shares of {title} on {env}",
-                        size=(3.5, 0.75 + 0.24 * own.sim_params.nunique()),
-                    )
+def _head_shares(page: Page, env: str) -> Block:
+    panels = []
+    for _, own in page.of_env(page.found.assignments, env).groupby("run", sort=False):
+        if own["head"].nunique() > 1:
+            title = f"{own.label.iloc[0]}, seed {own.seed.iloc[0]}"
+            panels.append(
+                page.panel(
+                    title,
+                    lambda axes, own=own: figures.head_shares(axes, own),
+                    f"Head shares of {title} on {env}",
+                    size=(3.5, 0.75 + 0.24 * own.sim_params.nunique()),
                 )
-        return {"panels": panels, "texts": [] if panels else ["No method with several heads."]}
-
-    heads = page.found.assignments["head"].max() if len(page.found.assignments) else 0
-    return {
-        "name": "head-shares",
-        "title": "Head shares",
-        "lead": "Share of the collected segments of each physics that each head explains best,"
-        " after the newest iteration, for every member. Head numbers are arbitrary: head 0 of one"
-        " member has nothing to do with head 0 of another.",
-        "legend": [f"head {head}" for head in range(min(int(heads) + 1, len(figures.HEADS)))],
-        "blocks": page.per_env(of_env),
-    }
-
-
-def _prediction_error(page: Page) -> Block:
-    def of_env(env: str) -> Block:
-        own = page.of_env(page.found.errors, env)
-        own = own[np.isfinite(own.error)]
-        groups = sorted(own.group.unique(), key=lambda group: group != TRAIN)
-        panels = [
-            page.panel(
-                group_label(group),
-                lambda axes, group=group: figures.error_lines(
-                    axes, own[own.group == group], page.looks
-                ),
-                f"Prediction error by imagined step on {env}, {group}",
             )
-            for group in groups
-        ]
-        return {"panels": panels, "texts": [] if panels else ["No prediction errors."]}
-
-    return {
-        "name": "prediction-error",
-        "title": "Prediction error by horizon",
-        "lead": "Root mean squared error of imagined observations on test episodes, in units of"
-        " each dimension's standard deviation; at the dotted line predicting the mean would do as"
-        " well. Lines are means over seeds, bands reach from the best to the worst seed. Episodes"
-        " are those of each run's own controller, so methods are measured where they went.",
-        "blocks": page.per_env(of_env),
-    }
+    return {"panels": panels, "texts": [] if panels else ["No method with several heads."]}
 
 
-def _settings(page: Page) -> Block:
-    def of_env(env: str) -> Block:
-        first = page.of_env(page.found.runs, env).drop_duplicates("label").set_index("label")["run"]
-        settings = {label: page.found.settings[run] for label, run in first.items()}
-        names = tables.differing(list(settings.values()), unless=("method", "seed"))
-        lines = [
-            {
-                "series": None,
-                "cells": [
-                    _cell(name, kind="code"),
-                    *(_cell(tables.value_text(table.get(name))) for table in settings.values()),
-                ],
-            }
-            for name in names
-        ]
-        columns = ["setting", *map(str, settings)]
-        texts = [] if names else ["All runs have the same settings."]
-        return {"table": {"columns": columns, "lines": lines}, "texts": texts}
-
-    return {
-        "name": "settings",
-        "title": "Settings that differ",
-        "lead": "Settings that are not the same in all runs, by environment. A dash stands where a"
-        " method has no such setting. Everything else is equal.",
-        "blocks": page.per_env(of_env),
-    }
+def _prediction_error(page: Page, env: str) -> Block:
+    own = page.of_env(page.found.errors, env)
+    own = own[np.isfinite(own.error)]
+    groups = sorted(own.group.unique(), key=lambda group: group != TRAIN)
+    panels = [
+        page.panel(
+            group_label(group),
+            lambda axes, group=group: figures.error_lines(
+                axes, own[own.group == group], page.looks
+            ),
+            f"Prediction error by imagined step on {env}, {group}",
+        )
+        for group in groups
+    ]
+    return {"panels": panels, "texts": [] if panels else ["No prediction errors."]}
 
 
-def _times(page: Page) -> Block:
-    def of_env(env: str) -> Block:
-        own = page.of_env(page.found.runs, env)
-        own = own[own["run"].isin(page.found.finished)]
-        means = own.groupby("label", sort=False)[list(PHASES)].mean()
-        longest = max(means.sum(axis=1), default=0) or 1.0
-        lines = []
-        for label, minutes in means.iterrows():
-            device = ", ".join(sorted(own.device[own.label == label].unique()))
-            numbers = [_cell(f"{value:,.1f}", kind="number") for value in [*minutes, minutes.sum()]]
-            bar = {**_cell("", kind="bar"), "widths": [100 * value / longest for value in minutes]}
-            lines.append(page.line(str(label), *numbers, bar, _cell(device)))
-        columns = ["method", *(f"{phase}, min" for phase in PHASES), "all, min", "", "device"]
-        texts = [] if lines else ["No run is finished yet."]
-        return {"table": {"columns": columns, "lines": lines}, "texts": texts}
+def _settings(page: Page, env: str) -> Block:
+    first = page.of_env(page.found.runs, env).drop_duplicates("label").set_index("label")["run"]
+    settings = {label: page.found.settings[run] for label, run in first.items()}
+    names = tables.differing(list(settings.values()), unless=("method", "seed"))
+    lines = []
+    for name in names:
+        values = (_cell(tables.value_text(table.get(name))) for table in settings.values())
+        lines.append({"series": None, "cells": [_cell(name, kind="code"), *values]})
+    columns = ["setting", *map(str, settings)]
+    texts = [] if names else ["All runs have the same settings."]
+    return {"table": {"columns": columns, "lines": lines}, "texts": texts}
 
-    return {
-        "name": "times",
-        "title": "Run times",
-        "lead": "Minutes per finished run, mean over seeds; from full to pale: collecting, fitting,"
-        " testing. They are comparable only where the runs had the machine to themselves.",
-        "blocks": page.per_env(of_env),
-    }
+
+def _times(page: Page, env: str) -> Block:
+    own = page.of_env(page.found.runs, env)
+    own = own[own["run"].isin(page.found.finished)]
+    means = own.groupby("label", sort=False)[list(PHASES)].mean()
+    longest = max(means.sum(axis=1), default=0) or 1.0
+    lines = []
+    for label, minutes in means.iterrows():
+        device = ", ".join(sorted(own.device[own.label == label].unique()))
+        numbers = [_cell(f"{value:,.1f}", kind="number") for value in [*minutes, minutes.sum()]]
+        bar = {**_cell("", kind="bar"), "widths": [100 * value / longest for value in minutes]}
+        lines.append(page.line(str(label), *numbers, bar, _cell(device)))
+    columns = ["method", *(f"{phase}, min" for phase in PHASES), "all, min", "", "device"]
+    texts = [] if lines else ["No run is finished yet."]
+    return {"table": {"columns": columns, "lines": lines}, "texts": texts}
 
 
 def _runs(page: Page) -> Block:
@@ -490,13 +421,7 @@ def _runs(page: Page) -> Block:
         cells = (_cell(str(run.env)), seed, done, _cell(str(run.preset)))
         lines.append(page.line(label, *cells, _cell(str(run.run), kind="code")))
     columns = ["method", "environment", "seed", "iterations", "preset", "directory"]
-    return {
-        "name": "runs",
-        "title": "Runs",
-        "lead": "Every run on this page. Its directory holds all settings (config.json), every test"
-        " episode (evaluation.csv) and everything else it measured.",
-        "blocks": [{"table": {"columns": columns, "lines": lines}}],
-    }
+    return {"table": {"columns": columns, "lines": lines}}
 
 
 def _numbers(page: Page) -> Block:
@@ -513,11 +438,5 @@ def _numbers(page: Page) -> Block:
         "standard deviation", "score",
     ]  # fmt: skip
     csv = table.rename(columns={"label": "method"}).to_csv(index=False)
-    return {
-        "name": "numbers",
-        "title": "Raw numbers",
-        "lead": "Each finished run's test episodes for every physics: mean and standard deviation"
-        " over episodes. Lines without a symbol are references.",
-        "blocks": [{"table": {"columns": columns, "lines": lines}}],
-        "csv": base64.b64encode(csv.encode()).decode(),
-    }
+    link = base64.b64encode(csv.encode()).decode()
+    return {"table": {"columns": columns, "lines": lines}, "csv": link}

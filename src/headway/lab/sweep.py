@@ -83,7 +83,7 @@ class Job:
 
     @property
     def state(self) -> State:
-        """How far the run is; `failed` where its directory is damaged or holds another run."""
+        """Progress; `failed` where its directory is damaged or holds another run."""
         if not (self.path / "config.json").exists():
             return State("missing", 0)
         run, total = RunDir(self.path), self.config.collection.num_iterations
@@ -153,14 +153,9 @@ class Comparison:
         return json.loads(json.dumps(facts, default=str))
 
     @property
-    def usual_folder(self) -> Path:
-        """Where the figure, the raw numbers and the table go, unless others are there."""
-        return self.out / f"{self.experiment.name}-{self.preset}"
-
-    @property
     def folder(self) -> Path:
-        """Where they go: over those of a comparison that this one contains, beside others."""
-        facts, usual = self.facts, self.usual_folder
+        """Folder of results: those of a comparison that this one contains are replaced."""
+        facts, usual = self.facts, self.out / f"{self.experiment.name}-{self.preset}"
         before = facts
         if (usual / NOTE).exists():
             try:
@@ -196,10 +191,10 @@ def fingerprint(config: Config) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Workers:
-    """Where runs are made, and with what."""
+    """Machines on which runs are made, and the share of them that a run takes."""
 
     one_by_one: bool = False
-    """Whether runs go one after another on this machine, without Ray."""
+    """Runs go one after another on this machine, without Ray."""
     address: str | None = None
     """The Ray cluster, for example `auto`; None starts Ray on this machine."""
     cpus_per_run: float = 1.0
@@ -408,7 +403,7 @@ class _RayTasks:
         return self
 
     def _options(self) -> dict[str, Any]:
-        """What every task reserves, and the environment of its process."""
+        """Reservations of every task, and the environment of its process."""
         cpus, gpus = self._workers.cpus_per_run, self._workers.gpus_per_run
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         if gpus is None:
