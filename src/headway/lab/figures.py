@@ -512,9 +512,13 @@ def save_run_figures(run_dir: str | Path) -> list[Path]:
         size = (max(1.3 * found.assignments.member.nunique() + 0.6, 5.6), 0.9 + 0.3 * rows)
         with drawn("head_shares", "Best head of each physics", caption, size) as drawing:
             head_shares(drawing.subplots(), found.assignments)
-            heads = {h: HEADS[h % len(HEADS)] for h in sorted(found.assignments["head"].unique())}
-            patches = {f"head {h}": {"color": c, "marker": "patch"} for h, c in heads.items()}
-            legend(drawing, patches)
+            legend(
+                drawing,
+                {
+                    f"head {head}": {"color": HEADS[head % len(HEADS)], "marker": "patch"}
+                    for head in sorted(found.assignments["head"].unique())
+                },
+            )
     if len(found.errors):
         caption = (
             f", iteration {found.errors.iteration.max() + 1}. Root mean squared error of imagined"
