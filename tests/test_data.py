@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 import toys
 from headway.data import (
     Episodes,
-    ReplayBuffer,
     Samples,
     Trajectory,
     history_action_moments,
@@ -136,14 +135,3 @@ def test_returns_are_the_undiscounted_sum_of_rewards():
     trajectory = Trajectory(np.zeros((4, 1)), np.zeros((3, 1)), np.array([1.0, 2.0, 4.0]), {})
     assert trajectory.returns == 7.0
     assert len(trajectory) == 3
-
-
-def test_buffer_keeps_everything_and_refuses_other_widths():
-    buffer = ReplayBuffer(2, 2)
-    for n in RAGGED:
-        buffer.add(toys.random_trajectory(n))
-    assert len(buffer) == len(RAGGED)
-    assert buffer.num_transitions == sum(RAGGED)
-    with pytest.raises(BadEnvironmentError, match=r"widths \(3, 1\), allowed: \(2, 2\)"):
-        buffer.add(Trajectory(np.zeros((2, 3)), np.zeros((1, 1)), np.zeros(1), {}))
-    assert len(buffer) == len(RAGGED)

@@ -1,4 +1,4 @@
-"""Trajectories, the replay buffer, and the views of it that a model is fitted to."""
+"""Trajectories, and the views of them that a model is fitted to."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -214,37 +214,6 @@ def segment_sums(
     padding = [(0, 0)] * (values.ndim - 1) + [(0, num_segments * segment_length - steps)]
     kept = jnp.pad(jnp.where(valid, values, 0.0), padding)
     return kept.reshape(*values.shape[:-1], num_segments, segment_length).sum(-1)
-
-
-class ReplayBuffer:
-    """Every trajectory collected so far; nothing is ever discarded (supplement A.2)."""
-
-    def __init__(self, obs_size: int, action_size: int):
-        self.obs_size = obs_size
-        self.action_size = action_size
-        self.trajectories: list[Trajectory] = []
-
-    def add(self, trajectory: Trajectory) -> None:
-        """Append one trajectory.
-
-        Raises:
-            BadEnvironmentError: Its observations or actions are of another width.
-        """
-        got = (trajectory.obs.shape[1], trajectory.action.shape[1])
-        if got != (self.obs_size, self.action_size):
-            raise BadEnvironmentError(
-                f"a trajectory has observations and actions of widths {got}, allowed:"
-                f" {(self.obs_size, self.action_size)}, as its Task says."
-            )
-        self.trajectories.append(trajectory)
-
-    @property
-    def num_transitions(self) -> int:
-        """Transitions held."""
-        return sum(len(trajectory) for trajectory in self.trajectories)
-
-    def __len__(self) -> int:
-        return len(self.trajectories)
 
 
 def history_action_moments(

@@ -1,4 +1,4 @@
-"""What the tests of GrBAL's and ReBAL's networks share."""
+"""Set-ups of the tests of GrBAL's and ReBAL's networks."""
 
 import jax
 import jax.numpy as jnp

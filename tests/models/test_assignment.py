@@ -1,4 +1,4 @@
-"""Which head owns which segment, and which samples an update sees."""
+"""The best head of each segment, and the samples of an update."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""What the context is, and where it joins the networks: against plain NumPy."""
+"""The context and the layers that it joins: against plain NumPy."""
 
 import dataclasses
 

@@ -25,7 +25,7 @@ def draws(seed, *shape):
 
 
 def exact(values):
-    """What is left of values in bfloat16, in float64."""
+    """Values rounded to bfloat16, in float64."""
     return np.asarray(rounded(values, jnp.bfloat16).astype(jnp.float32), np.float64)
 
 

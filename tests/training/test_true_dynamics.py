@@ -47,7 +47,7 @@ def random_actions(environments, rng):
 
 
 def play(environments, sequence):
-    """What the environments themselves pay for [env, horizon, action], in [-1, 1]."""
+    """Returns that the environments themselves pay for [env, horizon, action], in [-1, 1]."""
     total = np.zeros(environments.vector.num_envs)
     for step in range(sequence.shape[1]):
         actions = env_action(environments.task, sequence[:, step])
