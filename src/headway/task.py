@@ -202,7 +202,7 @@ def env_spec(name: str) -> EnvSpec:
 
     Args:
         name: A short name, a Gymnasium id, or `"my_package:cart"`: the EnvSpec `cart` of the
-            module `my_package`, or a function of that name that returns one.
+            module `my_package`.
 
     Raises:
         UnknownNameError: No such environment.
@@ -240,12 +240,10 @@ def _imported(path: str) -> EnvSpec:
     if not hasattr(module, name):
         known = [key for key, value in vars(module).items() if isinstance(value, EnvSpec)]
         raise unknown_name(f"environment of {module_name}", name, known)
-    found = getattr(module, name)
-    spec = found() if callable(found) else found
+    spec = getattr(module, name)  # never called: the name may come from somebody's config.json
     if not isinstance(spec, EnvSpec):
         raise ConfigError(
-            f"environment {path!r} is {type(spec).__name__}, allowed: an EnvSpec, or a function"
-            " without arguments that returns one."
+            f"environment {path!r} is of type {type(spec).__name__}, allowed: an EnvSpec."
         )
     return spec
 
