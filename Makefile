@@ -13,7 +13,7 @@ CONSTRAINED_PYTHONS ?= python3.11 python3.12
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-slow lint docs constraints clean
+.PHONY: help demo test test-slow lint docs release constraints clean
 .PHONY: bench bench-peers
 
 help: ## List the targets
@@ -40,11 +40,19 @@ bench: $(VENV)/test.stamp $(VENV)/bench.stamp ## Time planning, fitting and envi
 bench-peers: $(VENV)/main.stamp $(PEERS)/peers.stamp ## Time a plan of mbrl-lib beside Headway's; installs PyTorch
 	@$(BIN)/python benchmarks/peers/compare.py --peer-python $(PEERS)/bin/python
 
-docs: $(VENV)/test.stamp $(VENV)/docs.stamp ## Check links; write the site, guides and API reference, to site/
-	@$(BIN)/python -m pytest tests/test_package.py -k links
-	@rm -rf site
-	@$(BIN)/python -m sphinx -q -W --keep-going -c docs/site -d build/docs -E . site
+docs: $(VENV)/main.stamp $(VENV)/docs.stamp ## Write the site, guides and API reference, to site/
+	@$(BIN)/python -m mkdocs build -q -d site
 	@echo "The site is in site/index.html"
+
+release: $(VENV)/test.stamp ## Build wheel and sdist; try the wheel in a fresh environment
+	@rm -rf dist $(VENV)-release
+	@$(BIN)/python -m hatchling build -d dist
+	@$(PYTHON) -m venv $(VENV)-release
+	@$(VENV)-release/bin/python -m pip install -qq -c constraints.txt "$$(echo dist/*.whl)[lab]"
+	@cd $(VENV)-release && bin/headway train pendulum --preset smoke --run-dir try
+	@$(VENV)-release/bin/headway report $(VENV)-release/try -o $(VENV)-release/report.html
+	@rm -rf $(VENV)-release
+	@ls dist
 
 constraints: ## Rewrite constraints.txt from fresh installs of the newest versions
 	@for python in $(CONSTRAINED_PYTHONS); do \
