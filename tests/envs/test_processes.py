@@ -150,12 +150,13 @@ def test_what_cannot_be_made_is_told_at_once(made):
 
 
 PARENT = """
-import functools, os, sys
+import functools, os, signal, sys
 import misbehaving
 import numpy as np
 from headway.envs import ProcessVectorEnv
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
     one = functools.partial(misbehaving.Drift, sys.argv[1])
     vector = ProcessVectorEnv([one, misbehaving.Drift], step_timeout_s=500.0)
     print(*vector.pids, flush=True)
