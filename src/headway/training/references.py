@@ -7,7 +7,7 @@ poles. Its masses 0.15, 0.25 and 2.75, and all of its shorter episodes, are from
 with 16 episodes per unseen and 8 per training value.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from headway.config import Config
 from headway.errors import ConfigError
@@ -72,12 +72,6 @@ def score_of(row: EpisodeRow, config: Config) -> float | None:
     if config.env not in _MEASURED or env_options(config) != env_spec(config.env).options:
         return None
     return score(config.env, row.sim_params, row.episode_return, episode_length(config))
-
-
-def mean_score(scores: Sequence[float | None]) -> float | None:
-    """The mean, or None where one is unknown: what is known may not stand for the rest."""
-    known = [value for value in scores if value is not None]
-    return sum(known) / len(known) if known and len(known) == len(scores) else None
 
 
 def score(
