@@ -8,11 +8,12 @@ import sys
 
 import pytest
 
+import headway.training.evaluate
 from headway import api
 from headway.cli import COMMANDS, main, parse, read_seeds, read_settings
 from headway.errors import ConfigError, RunError
 from headway.lab import figures
-from headway.training.evaluate import PlanningCost
+from headway.training.evaluate import Evaluation, PlanningCost
 from headway.training.methods import METHODS, PRESETS, make_config
 from headway.training.run import EpisodeRow, RunDir
 from headway.training.stopping import Terminated
@@ -60,11 +61,11 @@ def calls(monkeypatch, tmp_path):
     def evaluate(run_dir, **asked):
         made.append({"run_dir": str(run_dir), **asked})
         cost = PlanningCost(300.0, 2.5e9, 0.0125)
-        return api.Evaluation(ROWS, make_config("pendulum"), cost)
+        return Evaluation(ROWS, make_config("pendulum"), cost)
 
     monkeypatch.setattr(figures, "save_run_figures", lambda path: [path.parent / "a.png"])
     monkeypatch.setattr(api, "train", train)
-    monkeypatch.setattr(api, "evaluate", evaluate)
+    monkeypatch.setattr(headway.training.evaluate, "evaluate", evaluate)
     return made
 
 

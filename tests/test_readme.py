@@ -14,11 +14,11 @@ import pytest
 import headway
 from headway import task
 from headway.cli import main
-from headway.config import MODELS, OwnModelConfig, setting_names
+from headway.config import MODELS, OwnModelConfig, known_settings
 from headway.errors import ConfigError
-from headway.training import learners, methods
-from headway.training.loading import load_agent
+from headway.training import methods, trainers
 from headway.training.run import RunDir
+from headway.training.trainers import load_agent
 
 ROOT = Path(__file__).parent.parent
 
@@ -157,7 +157,7 @@ def test_options_that_the_pages_show_exist(command, capsys):
 
 
 def test_settings_that_the_pages_name_exist():
-    known = setting_names(headway.make_config("pendulum"))
+    known = known_settings()
     for page in PAGES:
         named = re.findall(
             r"`((?:model|fitting|planner|collection|evaluation)\.(?!csv)[a-z_.]+)", page.read_text()
@@ -172,7 +172,7 @@ def ridge(tmp_path_factory):
     names: dict = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(methods, "METHODS", dict(methods.METHODS))
-        patch.setattr(learners, "LEARNERS", dict(learners.LEARNERS))
+        patch.setattr(trainers, "TRAINERS", dict(trainers.TRAINERS))
         patch.setitem(MODELS, "ridge", OwnModelConfig)
         patch.chdir(tmp_path_factory.mktemp("methods"))
         exec(compile(code.replace('"quick"', '"smoke"'), "methods.md", "exec"), names)
@@ -191,7 +191,7 @@ def test_own_method_guide(ridge):
 
 
 @pytest.mark.usefixtures("ridge")
-def test_an_own_learner_is_fitted_resumed_and_planned_with(tmp_path):
+def test_an_own_model_is_fitted_resumed_and_planned_with(tmp_path):
     """On dynamics that are linear it is exact, and a run goes on where it was."""
     settings = {"collection.num_iterations": 1}
     first = headway.train(
@@ -220,8 +220,8 @@ def test_what_cannot_be_registered():
     with pytest.raises(ConfigError, match=r"unknown setting 'model\.heads'"):
         headway.register_method(headway.Method("mine", "misspelt", {"model.heads": 3}))
     with pytest.raises(ConfigError, match="is not free"):
-        headway.register_learner("recurrent", headway.Learner)
-    with pytest.raises(ConfigError, match="no Learner"):
-        headway.register_learner("mine", dict)
+        headway.register_model("recurrent", headway.Trainer)
+    with pytest.raises(ConfigError, match="no Trainer"):
+        headway.register_model("mine", dict)
     with pytest.raises(ConfigError, match="kind is 'unheard'"):
         headway.make_config("pendulum", settings={"model.kind": "unheard"})

@@ -1,8 +1,6 @@
 # Public names and their modules, the only list of them; `__init__.py` loads each at its first use.
 
-from .api import Evaluation as Evaluation
 from .api import Run as Run
-from .api import evaluate as evaluate
 from .api import load as load
 from .api import train as train
 from .config import Config as Config
@@ -37,10 +35,8 @@ from .task import EnvSpec as EnvSpec
 from .task import Task as Task
 from .task import env_spec as env_spec
 from .task import register as register
-from .training.learners import Fit as Fit
-from .training.learners import Learned as Learned
-from .training.learners import Learner as Learner
-from .training.learners import register_learner as register_learner
+from .training.evaluate import Evaluation as Evaluation
+from .training.evaluate import evaluate as evaluate
 from .training.methods import METHODS as METHODS
 from .training.methods import PRESETS as PRESETS
 from .training.methods import Method as Method
@@ -48,6 +44,8 @@ from .training.methods import make_config as make_config
 from .training.methods import register_method as register_method
 from .training.run import EpisodeRow as EpisodeRow
 from .training.run import RunDir as RunDir
+from .training.trainers import Trainer as Trainer
+from .training.trainers import register_model as register_model
 
 __all__: list[str]
 __version__: str

@@ -1,20 +1,19 @@
-"""Train, evaluate, load. Importing this, and loading a controller, bring in no simulator."""
+"""Train and load. Importing this, and loading a controller, bring in no simulator."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
-
-import numpy as np
+from typing import Any
 
 from headway.config import Config
+from headway.models.compilation import prepare_jax
+from headway.planning.controller import Controller
+from headway.training.evaluate import returns_in_words
 from headway.training.methods import config_to_evaluate, make_config
-from headway.training.run import EpisodeRow, RunDir, format_sim_params
-
-if TYPE_CHECKING:
-    from headway.planning.controller import Controller
-    from headway.training.evaluate import PlanningCost
-    from headway.training.progress import Progress
+from headway.training.progress import Progress
+from headway.training.run import EpisodeRow, RunDir
+from headway.training.train import train_run
+from headway.training.trainers import load_agent
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +29,7 @@ class Run:
     evaluation: list[EpisodeRow]
     """Every test episode, as in `evaluation.csv`."""
 
-    def controller(self, *, seed: int = 0, **options: Any) -> "Controller":
+    def controller(self, *, seed: int = 0, **options: Any) -> Controller:
         """The trained controller; options are those of `load`."""
         return load(self.path, seed=seed, **options)
 
@@ -39,47 +38,8 @@ class Run:
         config, last = self.config, max((row.iteration for row in self.evaluation), default=0)
         tests = [row for row in self.evaluation if row.iteration == last]
         name = f"{config.method} on {config.env}, seed {config.seed}"
-        name += f", {len(self.metrics)} iterations{_returns(tests)}"
+        name += f", {len(self.metrics)} iterations{returns_in_words(tests)}"
         return f"Run({str(self.path)!r}: {name})"
-
-
-@dataclasses.dataclass(frozen=True)
-class Evaluation(Sequence[EpisodeRow]):
-    """Test episodes of a trained run, one after the other, and the cost of planning them."""
-
-    rows: list[EpisodeRow]
-    """Every test episode."""
-    config: Config
-    """All settings, as they were tested."""
-    cost: "PlanningCost"
-    """Candidates, arithmetic and time per step."""
-
-    @overload
-    def __getitem__(self, index: int) -> EpisodeRow: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[EpisodeRow]: ...
-    def __getitem__(self, index):
-        return self.rows[index]
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def __repr__(self) -> str:
-        """One line: the returns of each group."""
-        name = f"{self.config.method} on {self.config.env}, {len(self)} episodes"
-        return f"Evaluation({name}{_returns(self.rows)})"
-
-
-def _returns(rows: Sequence[EpisodeRow]) -> str:
-    """Mean return of each group in a few words; every physics of it counts once."""
-    groups: dict[str, dict[str, list[float]]] = {}
-    for row in rows:
-        physics = groups.setdefault(row.group, {})
-        physics.setdefault(format_sim_params(row.sim_params), []).append(row.episode_return)
-    return "".join(
-        f"; {group} {np.mean([np.mean(returns) for returns in physics.values()]):,.1f}"
-        for group, physics in groups.items()
-    )
 
 
 def train(  # noqa: PLR0913 (keywords, all with a default)
@@ -90,7 +50,7 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
     seed: int = 0,
     run_dir: str | Path | None = None,
     settings: Mapping[str, Any] | None = None,
-    progress: "Progress | None" = None,
+    progress: Progress | None = None,
     resume_from_last_good: bool = False,
 ) -> Run:
     """Train a controller on environments whose physics vary; resume if it was begun before.
@@ -114,55 +74,11 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
         BadEnvironmentError: The environment broke its contract.
         DivergenceError: Fitting lost all finite numbers.
     """
-    from headway.models.compilation import prepare_jax
-    from headway.training.train import train_run
-
     prepare_jax()
     config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
     usual = Path("runs") / f"{config.env}-{method}-{preset}-seed{seed}"
-    run = train_run(
-        config,
-        run_dir or usual,
-        progress,
-        resume_from_last_good=resume_from_last_good,
-    )
+    run = train_run(config, run_dir or usual, progress, resume_from_last_good=resume_from_last_good)
     return Run(run.path, config, run.metrics(), run.evaluation())
-
-
-def evaluate(
-    run_dir: str | Path,
-    *,
-    groups: Sequence[str] | None = None,
-    num_episodes: int | None = None,
-    settings: Mapping[str, Any] | None = None,
-    progress: "Progress | None" = None,
-) -> Evaluation:
-    """Test a trained run once more; nothing in its directory changes.
-
-    Args:
-        run_dir: The run directory.
-        groups: `"train"` or unseen groups; all of them by default.
-        num_episodes: Episodes per group; the run's own number by default.
-        settings: Changes of `planner` and `evaluation` settings by dotted name, for example
-            `{"planner.num_candidates": 50}`, to test the model with another planner.
-        progress: Shown while testing; silent by default.
-
-    Raises:
-        RunError: There is no trained run, or it is damaged.
-        UnknownNameError: No such group.
-        ConfigError: A setting is unknown, of the wrong type or out of range, or one that
-            training has fixed.
-    """
-    from headway.models.compilation import prepare_jax
-    from headway.training.evaluate import PlanningCost, run_tests
-
-    prepare_jax()
-    tested = run_tests(
-        run_dir, groups=groups, num_episodes=num_episodes, settings=settings, progress=progress
-    )
-    rows = tested.tests.rows(tested.config, tested.iteration)
-    cost = PlanningCost.of(tested.tests.use, tested.config, tested.task)
-    return Evaluation(rows, tested.config, cost)
 
 
 def load(
@@ -171,7 +87,7 @@ def load(
     seed: int = 0,
     settings: Mapping[str, Any] | None = None,
     **options: Any,
-) -> "Controller":
+) -> Controller:
     """Load the controller of a run.
 
     Args:
@@ -186,10 +102,6 @@ def load(
         ConfigError: A setting is unknown, of the wrong type or out of range, or none of the
             planner's; or as `Controller`.
     """
-    from headway.models.compilation import prepare_jax
-    from headway.planning.controller import Controller
-    from headway.training.loading import load_agent
-
     prepare_jax()
     run = RunDir(run_dir)
     config = config_to_evaluate(run.config(), settings or {}, ("planner",))

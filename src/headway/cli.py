@@ -261,10 +261,10 @@ class Evaluate(_OfRun):
     def run(self, words):
         """Test, print returns per physics, and what planning took."""
         settings = self.changed(self.config())
-        from headway import api
         from headway.lab import tables
+        from headway.training import evaluate
 
-        found = api.evaluate(
+        found = evaluate.evaluate(
             self.run_dir,
             groups=self.group or None,
             num_episodes=self.episodes,

@@ -9,6 +9,8 @@ defaults (`override`).
 
 import dataclasses
 import difflib
+import functools
+import operator
 import re
 import typing
 from collections.abc import Mapping
@@ -17,7 +19,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import pydantic
 from pydantic import Field
 
-from headway.errors import ConfigError, shown
+from headway.errors import ConfigError, did_you_mean, shown
 from headway.sim_params import SimParamSets
 
 LARGEST = 10**9
@@ -78,8 +80,7 @@ def _tagged(table: Mapping[str, type], tag: str) -> pydantic.PlainValidator:
             raise ValueError(f" is {shown(value)}, allowed: a table of settings.")
         name = value.get(tag, next(iter(table)))
         if not isinstance(name, str) or name not in table:
-            close = difflib.get_close_matches(str(name)[:80], table, n=1)
-            hint = f" Did you mean {close[0]!r}?" if close else ""
+            hint = did_you_mean(str(name), table)
             raise ValueError(f".{tag} is {shown(name)}.{hint} Allowed: {', '.join(table)}.")
         return pydantic.TypeAdapter(table[name]).validate_python(dict(value))
 
@@ -532,28 +533,20 @@ def override(config: Config, settings: Mapping[str, Any]) -> Config:
         if chosen is not None:
             *above, last = path.split(".")
             fields = {field.name for field in dataclasses.fields(chosen)}  # pyright: ignore
-            section = _section(values, above)
+            section = functools.reduce(operator.getitem, above, values)
             section[last] = {name: v for name, v in section[last].items() if name in fields}
-    sections = {name.rpartition(".")[0] for name in _known()}
+    sections = {name.rpartition(".")[0] for name in known_settings()}
     for name, value in settings.items():
         *above, last = name.split(".")
         if name in sections or ".".join(above) not in sections:
             raise ConfigError(_unknown(name))
-        _section(values, above)[last] = (
-            value.to_dict() if isinstance(value, SimParamSets) else value
-        )
+        functools.reduce(operator.getitem, above, values)[last] = value
     return from_dict(values)
 
 
-def _section(values: dict[str, Any], path: list[str]) -> dict[str, Any]:
-    for name in path:
-        values = values[name]
-    return values
-
-
-def _known() -> dict[str, list[str]]:
+def known_settings() -> dict[str, list[str]]:
     """Every setting that there is, by dotted name, and the choices of a union that have it."""
-    known: dict[str, list[str]] = {name: [] for name in setting_names(Config(env=""))}
+    known: dict[str, list[str]] = {name: [] for name in flatten(to_dict(Config(env="")))}
     for path, tag, classes in _UNIONS:
         for choice, cls in classes.items():
             for field in dataclasses.fields(cls):  # pyright: ignore[reportArgumentType]
@@ -563,7 +556,7 @@ def _known() -> dict[str, list[str]]:
 
 def _unknown(name: str) -> str:
     """Word the error for a setting that does not exist, with the closest one that does."""
-    known, name = _known(), name[:80]
+    known, name = known_settings(), name[:80]
     if known.get(name):
         return f"{name} is a setting of {' and '.join(known[name])} only; leave it out."
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
@@ -590,23 +583,11 @@ def _in_words(error: pydantic.ValidationError) -> str:
             apart = "" if not name or text.startswith((name, " ", ".")) else "."
             lines.append(f"{'' if text.startswith(name) else name}{apart}{text}")
         else:
-            close = difflib.get_close_matches(
-                str(found["input"])[:80], re.findall("'(.*?)'", allowed), n=1
-            )
-            hint = f" Did you mean {close[0]!r}?" if close and kind == "literal_error" else ""
+            choices = re.findall("'(.*?)'", allowed) if kind == "literal_error" else ()
+            hint = did_you_mean(str(found["input"]), choices)
             got = f"{name or 'the settings'} is {shown(found['input'])}"
             lines.append(f"{got}, allowed: {allowed}.{hint}")
     return " ".join(lines)
-
-
-def setting_names(section: Any, prefix: str = "") -> list[str]:
-    """Return the dotted names of all settings of a configuration."""
-    names = []
-    for field in dataclasses.fields(section):
-        value, name = getattr(section, field.name), prefix + field.name
-        inside = dataclasses.is_dataclass(value) and not isinstance(value, SimParamSets)
-        names += setting_names(value, f"{name}.") if inside else [name]
-    return names
 
 
 def differences(old: Config, new: Config) -> list[str]:

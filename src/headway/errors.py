@@ -63,6 +63,12 @@ def shown(value: Any) -> str:
         return "a number of thousands of digits"
 
 
+def did_you_mean(got: str, allowed: Iterable[str]) -> str:
+    """Suggest the closest allowed name, in words that follow a sentence; nothing if none is."""
+    close = difflib.get_close_matches(got[:80], list(allowed), n=1, cutoff=0.5)
+    return f" Did you mean {close[0]!r}?" if close else ""
+
+
 def unknown_name(kind: str, got: str, allowed: Iterable[str]) -> UnknownNameError:
     """Build the error for a name that is not in its table.
 
@@ -77,6 +83,5 @@ def unknown_name(kind: str, got: str, allowed: Iterable[str]) -> UnknownNameErro
     names = sorted(allowed)
     if not names:
         return UnknownNameError(f"unknown {kind} {shown(got)}. There is none; leave it out.")
-    close = difflib.get_close_matches(got[:80], names, n=1, cutoff=0.5)
-    hint = f" Did you mean {close[0]!r}?" if close else ""
+    hint = did_you_mean(got, names)
     return UnknownNameError(f"unknown {kind} {shown(got)}.{hint} Allowed: {', '.join(names[:99])}.")

@@ -254,8 +254,21 @@ def episode_length(config: "Config") -> int:
 
 
 def env_options(config: "Config") -> dict[str, bool]:
-    """All options of a run's environment: its own over the defaults."""
-    return {**env_spec(config.env).options, **config.env_options}
+    """All options of a run's environment: its own over the defaults.
+
+    Raises:
+        ConfigError: The environment has no such option.
+    """
+    spec = env_spec(config.env)
+    for option in config.env_options:
+        if option not in spec.options:
+            raise ConfigError(str(unknown_name(f"{spec.name} option", option, spec.options)))
+    return {**spec.options, **config.env_options}
+
+
+def task_of(config: "Config") -> Task:
+    """The Task of a run, with its environment's options."""
+    return env_spec(config.env).make_task(**env_options(config))
 
 
 def sim_param_sets(config: "Config") -> SimParamSets:

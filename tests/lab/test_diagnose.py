@@ -102,7 +102,7 @@ def test_the_tests_of_a_run_are_not_run_again(tested, monkeypatch):
         raise AssertionError("tests were run")
 
     with monkeypatch.context() as patched:
-        patched.setattr(lab, "run_tests", never)
+        patched.setattr(lab, "evaluate", never)
         found = headway.diagnose(tested)
         assert {group: len(episodes) for group, episodes in found.episodes.items()} == {
             "train": 3,

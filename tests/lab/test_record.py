@@ -16,7 +16,7 @@ from headway.lab import record as lab
 from headway.lab.figures import HEADS, INK
 from headway.lab.record import MARGIN, WIDTH, Recording, film
 from headway.planning.agent import Agent
-from headway.training.loading import load_task
+from headway.task import task_of
 from headway.training.methods import make_config
 from headway.training.run import RunDir
 
@@ -98,7 +98,7 @@ def test_without_heads_there_are_no_strips():
 def run_dir(tmp_path, monkeypatch):
     """A run whose agent acts at random."""
     monkeypatch.setattr(
-        lab, "load_agent", lambda run, config: Agent(None, load_task(config), PlannerConfig())
+        lab, "load_agent", lambda run, config: Agent(None, task_of(config), PlannerConfig())
     )
     run = RunDir(tmp_path / "run")
     run.begin(make_config("pendulum", preset="smoke"))

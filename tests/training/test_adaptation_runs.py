@@ -3,10 +3,9 @@
 import numpy as np
 
 import headway
-from headway.training import loading
-from headway.training.learners import make_learner
 from headway.training.methods import config_to_evaluate
 from headway.training.run import RunDir
+from headway.training.trainers import load_agent, make_trainer
 
 LAST_LAYER = {"planner.adaptation": "last-layer"}
 
@@ -24,10 +23,9 @@ def test_a_run_of_frozen_heads_is_tested_with_heads_that_learn(two_iterations):
 def test_the_prior_of_a_loaded_agent_comes_from_all_its_data(two_iterations):
     run = RunDir(two_iterations)
     config = config_to_evaluate(run.config(), LAST_LAYER)
-    agent = loading.load_agent(run, config)
+    agent = load_agent(run, config)
     assert agent.model.prior.root.shape[0] == agent.model.net.num_members
-    learned, task = loading.load_learned(run, config), loading.load_task(config)
-    learner = make_learner(config, task)
-    part = learner.agent(learned, trajectories=run.load_data()[:1])
+    trainer = make_trainer(config)
+    part = trainer.agent(trainer.load(run), run.load_data()[:1])
     assert (part.model.prior.noise != agent.model.prior.noise).all()
-    assert loading.load_agent(run).model.prior is None
+    assert load_agent(run).model.prior is None

@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+import headway
 import misbehaving
 import runs
 from headway import task
@@ -14,7 +15,6 @@ from headway.errors import BadEnvironmentError
 from headway.sim_params import SimParamSets
 from headway.task import EnvSpec, register
 from headway.training.collect import Environments, Episode, random_policy, run_episodes
-from headway.training.evaluate import run_tests
 from headway.training.methods import make_config
 from headway.training.run import RunDir
 from headway.training.train import train_run
@@ -63,7 +63,8 @@ def test_episodes_follow_their_own_schedules():
 
     def roll_out(*episodes):
         policy = random_policy(environments, np.random.default_rng(0))
-        return [t.obs for t in run_episodes(environments, episodes, policy).trajectories]
+        found = run_episodes(environments, episodes, policy).episodes
+        return [t.obs for t in found.values()]
 
     (first, second), (same, changed) = roll_out(plain, plain), roll_out(plain, changing)
     np.testing.assert_array_equal(first, same)
@@ -129,8 +130,8 @@ def test_tests_that_break_stop_the_run_until_they_may_be_left_out(drift, sound, 
     assert [row for row in whole if row != (0, "far", 0)] == left
     (tmp_path / "once").unlink()
     settings = {**PROCESSES, "evaluation.max_bad_episodes": 1}
-    again = run_tests(run.path, groups=["far"], settings=settings).tests.trajectories
-    assert len(again["far"]) == config().evaluation.num_episodes - 1
+    again = headway.evaluate(run.path, groups=["far"], settings=settings)
+    assert len(again) == config().evaluation.num_episodes - 1
 
 
 STOPS = [
@@ -193,8 +194,7 @@ def test_an_episode_that_mujoco_gives_up_is_left_out(tmp_path, monkeypatch):
     found = run_episodes(environments, [Episode(physics, seed) for seed in range(3)], falling)
     assert found.invalid.keys() == {1}
     assert "the simulation of half-cheetah diverged" in found.invalid[1]
-    assert [len(t) for t in found.trajectories] == [4, 4]
-    assert found.numbers == [0, 2]
+    assert {number: len(t) for number, t in found.episodes.items()} == {0: 4, 2: 4}
     environments.close()
 
 

@@ -9,9 +9,9 @@ import headway
 import headway.envs
 from headway.data import Trajectory
 from headway.models.multi_headed import network_input
-from headway.training import loading, train
-from headway.training.learners import make_learner
+from headway.training import train
 from headway.training.methods import make_config, told_sim_params
+from headway.training.trainers import make_trainer
 
 NEW = ("stacked", "cadm", "pets-cadm", "oracle-params", "ria")
 TINY = {"collection.episode_length": 12, "fitting.epochs": 1}
@@ -74,20 +74,17 @@ def fitted_error(method):
             "model.history_length": 5,
         },
     )
-    task = loading.load_task(config)
-    learner, learned = make_learner(config, task), loading.initial(config, task)
-    fit = learner.fit(masses(40), 0, jax.random.key(0))
-    *_, (state, _) = fit.epochs(learned.fit, 0)
-    statistics = fit.statistics
-    test = masses(4, seed=1)
-    episodes = learner.pad(test)
+    trainer = make_trainer(config)
+    *_, (state, _) = trainer.fit(trainer.begin(), masses(40), 0, jax.random.key(0))
+    model, statistics = state.fit.model, state.statistics
+    episodes = trainer.pad(masses(4, seed=1))
     row = jnp.repeat(jnp.arange(4), 25)[None]
     step = jnp.tile(jnp.arange(5, 30), 4)[None]
     past = episodes.history(row, step, 5)
-    context = state.model.context(past, statistics, episodes.sim_params[row])
+    context = model.context(past, statistics, episodes.sim_params[row])
     obs, next_obs = episodes.obs[row, step], episodes.obs[row, step + 1]
-    x = network_input(task, statistics, obs, episodes.action[row, step])
-    mean = state.model.forward_net(x, context).mean[0, 0, :, 2]
+    x = network_input(trainer.task, statistics, obs, episodes.action[row, step])
+    mean = model.forward_net(x, context).mean[0, 0, :, 2]
     delta = np.asarray(next_obs - obs)[0, :, 2]
     got = np.asarray(mean) * statistics.delta.std[2] + statistics.delta.mean[2]
     return float(np.square(got - delta).mean() / delta.var())

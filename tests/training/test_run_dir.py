@@ -21,6 +21,7 @@ from headway.errors import BusyError, RunError
 from headway.training.files import arrays_bytes, load_arrays, write_bytes
 from headway.training.run import RunDir
 from headway.training.train import train_run
+from headway.training.trainers import make_trainer
 
 FILES = [
     "config.json",
@@ -114,7 +115,7 @@ def test_a_damaged_checkpoint_is_not_loaded(root):
 def test_a_checkpoint_of_another_model_is_refused(root):
     config = runs.tiny_config(**{"model.hidden_sizes": (9, 9)})
     with pytest.raises(RunError, match="belongs to another model"):
-        headway.training.loading.load_learned(RunDir(root), config)
+        make_trainer(config).load(RunDir(root))
 
 
 def test_what_is_read_is_what_was_written(root):
@@ -142,7 +143,7 @@ def test_rows_of_an_unfinished_iteration_do_not_count(root, reference):
 
 
 def test_settings_versions_and_commit_are_kept(root):
-    found = RunDir(root).metadata()
+    found = json.loads((root / "config.json").read_bytes())
     assert RunDir(root).config() == runs.tiny_config()
     assert found["versions"]["jax"] == jax.__version__
     checkout = Path(headway.__file__).parents[2]

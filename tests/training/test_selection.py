@@ -21,8 +21,8 @@ TINY = PlannerConfig(
 )
 
 
-def make_agent(net, statistics=None, planner=TINY):
-    return toys.make_agent(net, planner, statistics=statistics or toys.odd_statistics())
+def make_agent(net, statistics=None):
+    return toys.make_agent(net, TINY, statistics=statistics or toys.odd_statistics())
 
 
 def by_hand(errors, chosen, deviations=None):
@@ -43,7 +43,7 @@ def test_it_examines_what_the_acting_agent_decided():
         obs.append(obs[-1] + np.float32([0.7, 1.2]) * actions[-1])
     trajectory = Trajectory(np.stack(obs), np.stack(actions), np.zeros(9), {"gain": 1.0})
     longer = toys.random_trajectory(14, seed=3)
-    found, _ = examine(agent, [trajectory, longer], key=jax.random.key(1))
+    found, _ = examine(agent.model, [trajectory, longer], key=jax.random.key(1))
     np.testing.assert_array_equal(found.chosen, np.stack(heads)[1:])
     assert found.errors.shape == (8, 2, 2)
     assert len(set(map(tuple, found.chosen))) > 1
@@ -72,7 +72,7 @@ def test_a_perfect_head_is_found_and_costs_nothing():
     model = toys.linear_model([[np.eye(2), -np.eye(2)], [-np.eye(2), np.eye(2)]])
     agent = make_agent(model, toys.identity_statistics())
     episodes = [toys.random_trajectory(12, seed=s, gain=g) for s, g in enumerate((1.0, -1.0, 1.0))]
-    found = examine(agent, episodes, key=jax.random.key(0))
+    found = examine(agent.model, episodes, key=jax.random.key(0))
     np.testing.assert_array_equal([e.best for e in found], [[0, 1], [1, 0], [0, 1]])
     summary = summarise(found, window=3)
     assert summary.wrong == 0
@@ -143,10 +143,10 @@ def test_dimensions_that_never_vary_are_not_calibrated():
     trajectory = toys.random_trajectory(8, constant=True)
     statistics = Statistics.fit(toys.POINT, [trajectory], 3)
     agent = make_agent(toys.small_model(), statistics)
-    (found,) = examine(agent, [trajectory], key=jax.random.key(0))
+    (found,) = examine(agent.model, [trajectory], key=jax.random.key(0))
     assert found.deviations.shape == (7, 2, 1)
 
 
 def test_an_episode_of_one_transition_has_nothing_to_examine():
     agent = make_agent(toys.small_model())
-    assert examine(agent, [toys.random_trajectory(1)], key=jax.random.key(0)) == []
+    assert examine(agent.model, [toys.random_trajectory(1)], key=jax.random.key(0)) == []

@@ -1,7 +1,5 @@
 """The whole loop, at smoke size: every environment, repeatability, divergence, early endings."""
 
-import dataclasses
-
 import jax
 import numpy as np
 import pytest
@@ -12,11 +10,11 @@ from headway.data import Trajectory
 from headway.errors import ConfigError, DivergenceError, PlanningError, UnknownNameError
 from headway.models.fitting import EpochStats
 from headway.task import env_names
-from headway.training import loading, train
+from headway.training import train
 from headway.training.collect import Environments
-from headway.training.learners import Learned, make_learner
 from headway.training.methods import make_config
 from headway.training.run import RunDir
+from headway.training.trainers import make_trainer
 
 
 def marked(env: str):
@@ -214,16 +212,14 @@ def test_what_diverges_for_good_stops_with_all_that_was_good(reference, tmp_path
 
 
 def fresh_model():
-    config = runs.tiny_config(**{"fitting.weight_decay": 0.0})
-    task = loading.load_task(config)
-    return make_learner(config, task), loading.initial(config, task)
+    trainer = make_trainer(runs.tiny_config(**{"fitting.weight_decay": 0.0}))
+    return trainer, trainer.begin()
 
 
-def with_bias(learned, at, value):
-    heads = learned.fit.model.forward_net.mean_heads
+def with_bias(state, at, value):
+    heads = state.fit.model.forward_net.mean_heads
     bias = heads.bias.at[at].set(value)
-    model = jax.tree.map(lambda x: bias if x is heads.bias else x, learned.fit.model)
-    return Learned(dataclasses.replace(learned.fit, model=model), learned.statistics)
+    return jax.tree.map(lambda x: bias if x is heads.bias else x, state)
 
 
 def episodes(scale=1.0, steps=6, *, constant=False, dtype=np.float32):
@@ -239,9 +235,9 @@ def episodes(scale=1.0, steps=6, *, constant=False, dtype=np.float32):
 
 
 def test_the_member_the_head_and_the_physics_of_a_divergence_are_named():
-    learner, learned = fresh_model()
-    learned = with_bias(learned, (1, 2), np.nan)
-    found = train.first_non_finite(episodes(), list(learner.head_losses(learned, episodes())))
+    trainer, state = fresh_model()
+    losses = trainer.head_losses(with_bias(state, (1, 2), np.nan), episodes())
+    found = train.first_non_finite(episodes(), losses)
     assert found == "member 1, head 2, at step 0 under sim_params {'length': 1.0}"
 
 
@@ -251,32 +247,30 @@ def test_the_member_the_head_and_the_physics_of_a_divergence_are_named():
     ids=str,
 )
 def test_odd_data_are_fitted_with_finite_numbers(settings):
-    learner, learned = fresh_model()
-    fit = learner.fit(episodes(**settings), 5, jax.random.key(0))
-    for state, found in fit.epochs(learned.fit, 0):
+    trainer, begun = fresh_model()
+    for state, found in trainer.fit(begun, episodes(**settings), 5, jax.random.key(0)):
         assert int(found.skipped) == 0
         assert np.isfinite(found.loss)
-        assert all(np.isfinite(x).all() for x in jax.tree.leaves(state.model))
+        assert all(np.isfinite(x).all() for x in jax.tree.leaves(state.fit.model))
 
 
 def test_a_head_that_wins_nothing_is_harmless():
     """It keeps its weights but for weight decay, owns nothing, and the agent acts without it."""
-    learner, learned = fresh_model()
-    learned = with_bias(learned, (slice(None), 1), 1e3)
-    before = learned.fit.model.forward_net.mean_heads
+    trainer, state = fresh_model()
+    state = with_bias(state, (slice(None), 1), 1e3)
+    before = state.fit.model.forward_net.mean_heads
     data = [t for steps in (6, 1, 3) for t in episodes(steps=steps)]
-    fit = learner.fit(data, 5, jax.random.key(0))
-    for state, found in fit.epochs(learned.fit, 0):
+    for fitted, found in trainer.fit(state, data, 5, jax.random.key(0)):
         assert int(found.skipped) == 0
-        learned = Learned(state, fit.statistics)
-    after = learned.fit.model.forward_net.mean_heads
+        state = fitted
+    after = state.fit.model.forward_net.mean_heads
     np.testing.assert_array_equal(after.bias[:, 1], 1e3)
     np.testing.assert_array_equal(after.weight[:, 1], before.weight[:, 1])
     assert (after.weight[:, [0, 2]] != before.weight[:, [0, 2]]).any((1, 2, 3)).all()
-    shares = learner.head_shares(learned, data)
+    shares = trainer.head_shares(state, data)
     assert {row["share"] for row in shares if row["head"] == 1} == {0.0}
-    agent = learner.agent(learned)
-    state = agent.init(1, key=jax.random.key(0))
+    agent = trainer.agent(state)
+    acting = agent.init(1, key=jax.random.key(0))
     for obs in data[0].obs[:3]:
-        state, decision = agent.act(state, obs[None])
+        acting, decision = agent.act(acting, obs[None])
         assert np.isfinite(decision.action).all()

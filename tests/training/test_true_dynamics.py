@@ -13,9 +13,8 @@ from headway.models.simulator import ClassicSimulator, RobotSimulator
 from headway.planning.rollouts import candidate_returns
 from headway.task import env_action, env_names, env_spec
 from headway.training.collect import Environments
-from headway.training.learners import make_learner
-from headway.training.loading import initial
 from headway.training.methods import make_config
+from headway.training.trainers import make_trainer
 
 CLASSIC = ["pendulum", "cartpole-swingup"]
 ROBOTS = ["hopper", "slim-humanoid", "half-cheetah", "crippled-ant"]
@@ -75,8 +74,7 @@ def test_compiled_equations_step_as_the_environment_under_every_physics(env):
 
 
 def agent_of(config, environments):
-    learner = make_learner(config, environments.task)
-    return learner.agent(initial(config, environments.task), environments)
+    return make_trainer(config, environments).agent(())
 
 
 def simulator_of(config, environments):
@@ -102,9 +100,7 @@ def test_imagined_returns_of_the_equations_are_what_the_environment_pays(env):
 
 def test_a_step_plans_from_where_the_environments_are_now():
     config, environments = begin("pendulum", every_physics("pendulum")[:2])
-    agent = make_learner(config, environments.task).agent(
-        initial(config, environments.task), environments
-    )
+    agent = agent_of(config, environments)
     state = agent.init(2, key=jax.random.key(0))
     for _ in range(2):
         obs = environments.vector.step(np.ones((2, 1), np.float32))[0]

@@ -14,8 +14,7 @@ from headway.errors import ConfigError
 from headway.lab.tables import COLLECTED, distinct, full_label, group_label, new_table, varying
 from headway.models.acting import MultiHeadModel
 from headway.task import sim_param_sets
-from headway.training.evaluate import known_groups, run_tests
-from headway.training.loading import load_agent
+from headway.training.evaluate import evaluate, known_groups
 from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
 from headway.training.run import RunDir
@@ -26,6 +25,7 @@ from headway.training.selection import (
     examine,
     summarise,
 )
+from headway.training.trainers import load_agent
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,15 +110,15 @@ def diagnose(
         if kept.keys() >= set(wanted):
             trajectories = {group: kept[group] for group in wanted}
     if not trajectories:
-        tested = run_tests(
+        tested = evaluate(
             run_dir, groups=groups, num_episodes=num_episodes, settings=settings, progress=progress
         )
-        config, trajectories = tested.config, tested.tests.trajectories
+        config, trajectories = tested.config, tested.trajectories
     agent = load_agent(run, config)
     assert isinstance(agent.model, MultiHeadModel)
     key = jax.random.key(config.evaluation.seed)
     episodes = {
-        group: examine(agent, found, key=jax.random.fold_in(key, i))
+        group: examine(agent.model, found, key=jax.random.fold_in(key, i))
         for i, (group, found) in enumerate(trajectories.items())
     }
     return Diagnosis(run.path, config, {group: found for group, found in episodes.items() if found})

@@ -19,10 +19,10 @@ from headway.lab.tables import full_label
 from headway.planning.controller import Controller
 from headway.task import env_options, episode_length
 from headway.training.files import write_bytes
-from headway.training.loading import load_agent
 from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
 from headway.training.run import RunDir
+from headway.training.trainers import load_agent
 
 FORMATS = (".gif", ".mp4")
 WIDTH, MARGIN, LINE, ROW, GAP = 480, 12, 18, 9, 2  # pixels

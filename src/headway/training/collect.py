@@ -7,21 +7,28 @@ import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Float, Int, PRNGKeyArray
 
 from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import BadEnvironmentError, HeadwayError
 from headway.planning.agent import Agent
 from headway.sim_params import SimParamSets
-from headway.task import Task, env_action, env_options, env_spec, episode_length, sim_param_sets
+from headway.task import (
+    Task,
+    env_action,
+    env_options,
+    episode_length,
+    sim_param_sets,
+    task_of,
+)
 from headway.training.files import Arrays
-from headway.training.run import trajectories_from, trajectory_arrays
+from headway.training.run import Partial, trajectories_from, trajectory_arrays
 
 if TYPE_CHECKING:
     from gymnasium.vector import VectorEnv
@@ -33,8 +40,6 @@ class Episode:
 
     sim_params: dict[str, float]
     seed: int
-    schedule: Mapping[int, dict[str, float]] = dataclasses.field(default_factory=dict)
-    """Physics that change during the episode, by the step before which they do."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +65,7 @@ class Environments:
         from headway import envs
 
         collection, options = config.collection, env_options(config)
-        task, sim_params = env_spec(config.env).make_task(**options), sim_param_sets(config)
+        task, sim_params = task_of(config), sim_param_sets(config)
         vector = envs.make_vec(
             config.env,
             collection.num_episodes,
@@ -107,8 +112,10 @@ def random_policy(environments: Environments, rng: np.random.Generator) -> Polic
     return lambda obs: Choice(rng.uniform(-1.0, 1.0, shape).astype(np.float32), none, none)
 
 
-class AgentPolicy:
-    """An agent and what it remembers of each environment; it starts with an empty memory.
+def agent_policy(
+    agent: Agent, num_envs: int, episodes: Sequence[Episode], *, key: PRNGKeyArray
+) -> Policy:
+    """An agent that remembers each environment; it starts with an empty memory.
 
     Args:
         agent: The agent.
@@ -117,18 +124,15 @@ class AgentPolicy:
             repeat the last episode.
         key: The planner's draws.
     """
+    physics = [episode.sim_params for episode in fill(episodes, num_envs)]
+    state = agent.init(num_envs, key=key, sim_params=physics)
 
-    def __init__(
-        self, agent: Agent, num_envs: int, episodes: Sequence[Episode], *, key: PRNGKeyArray
-    ):
-        self._agent = agent
-        physics = [episode.sim_params for episode in fill(episodes, num_envs)]
-        self.state = agent.init(num_envs, key=key, sim_params=physics)
-
-    def __call__(self, obs: Float[np.ndarray, "env obs"]) -> Choice:
-        """Choose for every environment."""
-        self.state, decision = self._agent.act(self.state, jnp.asarray(obs, jnp.float32))
+    def choose(obs: Float[np.ndarray, "env obs"]) -> Choice:
+        nonlocal state
+        state, decision = agent.act(state, jnp.asarray(obs, jnp.float32))
         return Choice(*jax.device_get((decision.action, decision.failures, decision.evaluations)))
+
+    return choose
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,32 +157,27 @@ class PlannerUse:
 
 @dataclasses.dataclass(frozen=True)
 class Rollout:
-    """Finished episodes, in the order they were asked for, without the invalid ones."""
+    """Finished episodes by their number among those asked for, without the invalid ones."""
 
-    trajectories: list[Trajectory]
+    episodes: dict[int, Trajectory]
     use: PlannerUse
-    invalid: Mapping[int, str] = dataclasses.field(default_factory=dict)
-    """Why an episode is left out, by its number among those asked for."""
-    seconds: float = 0.0
+    invalid: dict[int, str]
+    """Why an episode is left out, by its number."""
+    seconds: float
     """Of all of it."""
-
-    @property
-    def numbers(self) -> list[int]:
-        """The number of each trajectory's episode among those asked for."""
-        asked = range(len(self.trajectories) + len(self.invalid))
-        return [number for number in asked if number not in self.invalid]
 
     def to_part(self) -> tuple[Arrays, dict[str, Any]]:
         """Arrays and facts for `Partial.save`."""
-        arrays, facts = trajectory_arrays(self.trajectories)
-        use, invalid = dataclasses.asdict(self.use), list(map(list, self.invalid.items()))
-        return arrays, {**facts, "use": use, "invalid": invalid, "seconds": self.seconds}
+        arrays, facts = trajectory_arrays(list(self.episodes.values()))
+        facts |= {"numbers": list(self.episodes), "use": dataclasses.asdict(self.use)}
+        return arrays, facts | {"invalid": list(self.invalid.items()), "seconds": self.seconds}
 
     @classmethod
     def from_part(cls, arrays: Arrays, facts: Mapping[str, Any]) -> Self:
         """Build what `to_part` took apart."""
+        episodes = dict(zip(facts["numbers"], trajectories_from(arrays, facts), strict=True))
         use, invalid = PlannerUse(**facts["use"]), dict(facts["invalid"])
-        return cls(trajectories_from(arrays, facts), use, invalid, facts["seconds"])
+        return cls(episodes, use, invalid, facts["seconds"])
 
 
 def run_episodes(
@@ -210,18 +209,16 @@ def run_episodes(
             for name in filled[0].sim_params
         }
     }
-    if any(episode.schedule for episode in filled):
-        options["schedule"] = [episode.schedule for episode in filled]
     seeds: Any = [episode.seed for episode in filled]
     valid = _ValidityFilter(environments.name, [episode.sim_params for episode in filled])
+    running = valid.running
     with valid.raising("reset"):
         obs, info = vector.reset(seed=seeds, options=options)
-    valid.note(info, 0)
+    valid.heed(info, 0)
     obs = valid.finite(obs, "obs", 0, np.zeros((len(filled), environments.task.obs_size)))
     observations, actions, rewards = [obs], [], []
     length = np.zeros(len(filled), np.int64)
     terminated = np.zeros(len(filled), bool)
-    running = ~valid.broken
     use = PlannerUse()
     for step in range(1, environments.episode_length + 1):
         started = time.perf_counter()
@@ -238,21 +235,20 @@ def run_episodes(
         )
         with valid.raising(f"step {step}"):
             obs, reward, ends, cut, info = vector.step(env_action(environments.task, choice.action))
-        valid.running = running
-        valid.note(info, step)
+        valid.heed(info, step)
         obs = valid.finite(obs, "obs", step, observations[-1])
         observations.append(obs)
         rewards.append(valid.finite(reward, "reward", step, np.zeros(len(filled))))
         actions.append(choice.action)
         length += running
         terminated |= running & ends
-        running &= ~(ends | cut | valid.broken)
+        running &= ~(ends | cut)
         on_step(wanted)
         if not running[:wanted].any():
             break
     table = np.stack(observations, 1), np.stack(actions, 1), np.stack(rewards, 1)
-    trajectories = [
-        Trajectory(
+    trajectories = {
+        row: Trajectory(
             obs=table[0][row, : length[row] + 1].astype(np.float32),
             action=table[1][row, : length[row]].astype(np.float32),
             reward=table[2][row, : length[row]].astype(np.float64),
@@ -260,8 +256,8 @@ def run_episodes(
             terminated=bool(terminated[row]),
         )
         for row, episode in enumerate(episodes)
-        if not valid.broken[row]
-    ]
+        if row not in valid.reasons
+    }
     invalid = {row: valid.reasons[row] for row in sorted(valid.reasons) if row < wanted}
     return Rollout(trajectories, use, invalid, time.perf_counter() - begun)
 
@@ -282,19 +278,19 @@ class _ValidityFilter:
     def __init__(self, name: str, physics: Sequence[Mapping[str, float]]):
         self._name, self._physics = name, physics
         self.running = np.ones(len(physics), bool)
+        """Cleared where an episode breaks; its other ends are for the caller to clear."""
         self.reasons: dict[int, str] = {}
 
-    @property
-    def broken(self) -> Bool[np.ndarray, " env"]:
-        """The environments whose episode broke."""
-        return np.isin(np.arange(len(self._physics)), list(self.reasons))
+    def _note(self, row: int, reason: str) -> None:
+        if self.running[row]:
+            self.running[row] = False
+            self.reasons[row] = reason
 
-    def note(self, info: Mapping[str, Any], step: int) -> None:
+    def heed(self, info: Mapping[str, Any], step: int) -> None:
         """Note the episodes of which the environments themselves say that they broke."""
         for row, reason in info.get("broken", {}).items():
-            if self.running[row]:
-                where = f"{self._name} broke at step {step} under {self._physics[row]}"
-                self.reasons.setdefault(row, f"{where}: {' '.join(reason.split())[:300]}")
+            where = f"{self._name} broke at step {step} under {self._physics[row]}"
+            self._note(row, f"{where}: {' '.join(reason.split())[:300]}")
 
     @contextlib.contextmanager
     def raising(self, when: str) -> Iterator[None]:
@@ -329,44 +325,67 @@ class _ValidityFilter:
                 f" step {step}, allowed: numbers of shape {instead.shape}; correct the environment."
             )
         bad = ~np.isfinite(values.reshape(len(values), -1)).all(1)
-        for row in np.flatnonzero(bad & self.running).tolist():
-            self.reasons.setdefault(
-                row,
-                f"{self._name} returned a non-finite {what} at step {step} under"
-                f" {self._physics[row]}",
-            )
-        if not bad.any():
-            return values
+        for row in np.flatnonzero(bad).tolist():
+            where = f"a non-finite {what} at step {step} under {self._physics[row]}"
+            self._note(row, f"{self._name} returned {where}")
         return np.where(bad.reshape(-1, *[1] * (values.ndim - 1)), instead, values)
 
 
-class InvalidEpisodes:
-    """Says which episodes are left out, until there are too many.
+class Batches:
+    """Runs batches of episodes; keeps what is finished, and stops where too many are invalid.
 
     Args:
-        setting: The name of the limit.
-        allowed: How many may be left out.
+        environments: Where they are run.
+        config: Settings of the run.
+        phase: `collection` or `evaluation`: whose setting `max_bad_episodes` holds.
+        on_step: Called with the number of environments that stepped.
         say: Shows a line.
+        partial: Keeps finished batches, for when the process is killed.
     """
 
-    def __init__(self, setting: str, allowed: int, say: Callable[[str], None]):
-        self._setting, self._allowed, self._say = setting, allowed, say
+    def __init__(
+        self,
+        environments: Environments,
+        config: Config,
+        phase: Literal["collection", "evaluation"],
+        on_step: Callable[[int], None],
+        say: Callable[[str], None],
+        partial: Partial | None = None,
+    ):
+        self.environments, self.config, self.partial = environments, config, partial
+        self._setting = f"{phase}.max_bad_episodes"
+        self._allowed = getattr(config, phase).max_bad_episodes
+        self._on_step, self._say = on_step, say
         self._reasons: list[str] = []
 
-    def leave_out(self, rollout: Rollout) -> None:
-        """Count the invalid episodes of a rollout.
+    def run(self, name: str, episodes: Sequence[Episode], policy: Callable[[], Policy]) -> Rollout:
+        """Run a batch, unless it was finished before.
+
+        Args:
+            name: Of the batch.
+            episodes: At most as many as there are environments.
+            policy: Makes the policy that chooses the actions.
 
         Raises:
-            BadEnvironmentError: There are too many.
+            BadEnvironmentError: More episodes broke than allowed, or the environment raised.
         """
+        kept = self.partial.load(name) if self.partial else None
+        if kept is None:
+            rollout = run_episodes(self.environments, episodes, policy(), self._on_step)
+        else:
+            rollout = Rollout.from_part(*kept)
+            self._on_step(len(episodes) * self.environments.episode_length)
         self._reasons += rollout.invalid.values()
         if len(self._reasons) > self._allowed:
             raise self.too_many()
         for reason in rollout.invalid.values():
             self._say(f"{reason}; the episode is dropped.")
+        if self.partial and kept is None and rollout.episodes:
+            self.partial.save(name, *rollout.to_part())
+        return rollout
 
     def too_many(self) -> BadEnvironmentError:
-        """Word the error for more than allowed, or for all."""
+        """Word the error for more invalid episodes than allowed, or for nothing else."""
         return BadEnvironmentError(
             f"{len(self._reasons)} episodes broke, allowed: {self._allowed} ({self._setting}), and"
             f" not all; the first: {self._reasons[0]}. Mend the environment under these physics, or"

@@ -8,29 +8,27 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.data import Trajectory, sim_params_row
 from headway.models.base import Keys, Model, RecentTransitions, live_through
-from headway.planning.agent import Agent
 from headway.planning.rollouts import follow
 
 NUM_STARTS = 256  # imagined rollouts per group in `prediction_error`
 
 
 def prediction_error(
-    agent: Agent, trajectories: list[Trajectory], *, first: int, key: PRNGKeyArray
+    model: Model, trajectories: list[Trajectory], first: int, horizon: int, key: PRNGKeyArray
 ) -> Float[np.ndarray, " step"]:
-    """Root mean squared error of imagined observations by step, over one planning horizon.
+    """Root mean squared error of imagined observations by step.
 
     From evenly spread moments of real episodes the model predicts, without noise, what the
     episode's own actions lead to, after it has lived through what went before. Errors are in
     units of each dimension's standard deviation over these episodes; members are averaged over.
 
     Args:
-        agent: With a model that was trained.
+        model: As it was trained.
         trajectories: Real episodes.
         first: Steps of an episode before the first moment.
+        horizon: Imagined steps.
         key: Draws of a head selection that is random or sampled.
     """
-    model, horizon = agent.model, agent.planner.horizon
-    assert model is not None
     starts = [(t, s) for t in trajectories for s in range(first, len(t) - horizon + 1)]
     if not starts:
         return np.zeros(0)

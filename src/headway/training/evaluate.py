@@ -1,34 +1,28 @@
 """Testing a controller on training and unseen physics (supplement A.2)."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import jax
+import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import unknown_name
+from headway.models.compilation import prepare_jax
 from headway.planning.agent import Agent
 from headway.planning.flop import plan_flop
 from headway.sim_params import SimParamSets
-from headway.task import Task
-from headway.training.collect import (
-    AgentPolicy,
-    Environments,
-    Episode,
-    InvalidEpisodes,
-    PlannerUse,
-    Rollout,
-    run_episodes,
-)
-from headway.training.loading import load_agent
+from headway.training.collect import Batches, Environments, Episode, PlannerUse, agent_policy
 from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
-from headway.training.run import EpisodeRow, Partial, RunDir
+from headway.training.run import EpisodeRow, RunDir, format_sim_params
+from headway.training.trainers import load_agent
 
 GROUP_SEEDS = 1000  # seeds reserved for each group, so that groups never share an episode
 
@@ -71,15 +65,46 @@ class PlanningCost:
     The first step of each batch is left out, because it may compile.
     """
 
-    @classmethod
-    def of(cls, use: PlannerUse, config: Config, task: Task) -> "PlanningCost":
-        """The averages of what was counted."""
-        evaluations = use.evaluations / use.steps
-        return cls(
-            evaluations,
-            plan_flop(config.model, config.planner, task, evaluations),
-            use.seconds / use.timed_steps if use.timed_steps else None,
-        )
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation(Sequence[EpisodeRow]):
+    """Test episodes of a trained run, one after the other, and the cost of planning them."""
+
+    rows: list[EpisodeRow]
+    """Every test episode."""
+    config: Config
+    """All settings, as they were tested."""
+    cost: PlanningCost
+    """Candidates, arithmetic and time per step."""
+    trajectories: Mapping[str, list[Trajectory]] = dataclasses.field(default_factory=dict)
+    """The same episodes step by step, by group."""
+
+    @overload
+    def __getitem__(self, index: int) -> EpisodeRow: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[EpisodeRow]: ...
+    def __getitem__(self, index):
+        return self.rows[index]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __repr__(self) -> str:
+        """One line: the returns of each group."""
+        name = f"{self.config.method} on {self.config.env}, {len(self)} episodes"
+        return f"Evaluation({name}{returns_in_words(self.rows)})"
+
+
+def returns_in_words(rows: Sequence[EpisodeRow]) -> str:
+    """Mean return of each group; every physics of it counts once."""
+    groups: dict[str, dict[str, list[float]]] = {}
+    for row in rows:
+        physics = groups.setdefault(row.group, {})
+        physics.setdefault(format_sim_params(row.sim_params), []).append(row.episode_return)
+    return "".join(
+        f"; {group} {np.mean([np.mean(returns) for returns in physics.values()]):,.1f}"
+        for group, physics in groups.items()
+    )
 
 
 def group_episodes(
@@ -101,34 +126,21 @@ def group_episodes(
     return [Episode(each, first + i) for i, each in enumerate(physics)]
 
 
-def evaluate_agent(  # noqa: PLR0913
-    agent: Agent,
-    environments: Environments,
-    config: Config,
-    groups: Sequence[str],
-    *,
-    key: PRNGKeyArray,
-    progress: Progress,
-    on_step: Callable[[int], None] | None = None,
-    partial: Partial | None = None,
-) -> Tests:
-    """Run the test episodes of some groups, as many side by side as the batch holds.
+def run_tests(agent: Agent, groups: Sequence[str], batches: Batches, key: PRNGKeyArray) -> Tests:
+    """Run the test episodes of some groups, as many side by side as a batch holds.
 
     Args:
         agent: The agent to test.
-        environments: Where it acts.
-        config: Settings of the run.
         groups: `train` or unseen groups.
+        batches: Runs them.
         key: The planner's draws.
-        progress: Counts the steps, and says which episodes broke.
-        on_step: Called with the number of steps instead of `progress.advance`.
-        partial: Keeps finished episodes, for when the process is killed.
 
     Raises:
         BadEnvironmentError: More episodes broke than allowed, or all of a group.
     """
-    evaluation, size = config.evaluation, environments.vector.num_envs
-    episodes = [
+    evaluation, environments = batches.config.evaluation, batches.environments
+    size = environments.vector.num_envs
+    asked = [
         (group, number, episode)
         for group in groups
         for number, episode in enumerate(
@@ -136,63 +148,39 @@ def evaluate_agent(  # noqa: PLR0913
         )
     ]
     found: dict[str, dict[int, Trajectory]] = {group: {} for group in groups}
-    use, seconds, on_step = PlannerUse(), 0.0, on_step or progress.advance
-    invalid = InvalidEpisodes(
-        "evaluation.max_bad_episodes", evaluation.max_bad_episodes, progress.message
-    )
-    for chunk, start in enumerate(range(0, len(episodes), size)):
-        batch = episodes[start : start + size]
-        side_by_side = [episode for _, _, episode in batch]
-        kept = partial.load(f"evaluate-{chunk}") if partial else None
-        if kept is not None:
-            rollout = Rollout.from_part(*kept)
-            progress.advance(len(batch) * environments.episode_length)
-        else:
-            chunk_key = jax.random.fold_in(key, chunk)
-            policy = AgentPolicy(agent, size, side_by_side, key=chunk_key)
-            rollout = run_episodes(environments, side_by_side, policy, on_step)
-        invalid.leave_out(rollout)
-        if partial and kept is None:
-            partial.save(f"evaluate-{chunk}", *rollout.to_part())
+    use, seconds = PlannerUse(), 0.0
+    for chunk, start in enumerate(range(0, len(asked), size)):
+        batch = asked[start : start + size]
+        episodes, chunk_key = [episode for *_, episode in batch], jax.random.fold_in(key, chunk)
+        policy = partial(agent_policy, agent, size, episodes, key=chunk_key)
+        rollout = batches.run(f"evaluate-{chunk}", episodes, policy)
         use, seconds = use + rollout.use, seconds + rollout.seconds
-        for place, trajectory in zip(rollout.numbers, rollout.trajectories, strict=True):
+        for place, trajectory in rollout.episodes.items():
             group, number, _ = batch[place]
             found[group][number] = trajectory
     if not all(found.values()):
-        if partial:  # when the environment is mended, they are run again
-            partial.remove("evaluate-*")
-        raise invalid.too_many()
+        if batches.partial:  # when the environment is mended, they are run again
+            batches.partial.remove("evaluate-*")
+        raise batches.too_many()
     return Tests(found, use, seconds)
 
 
-@dataclasses.dataclass(frozen=True)
-class Tested:
-    """Test episodes of a trained run, and what they were run with."""
-
-    config: Config
-    """All settings, as they were tested."""
-    iteration: int
-    """The run's last finished iteration."""
-    agent: Agent
-    task: Task
-    tests: Tests
-
-
-def run_tests(
+def evaluate(
     run_dir: str | Path,
     *,
     groups: Sequence[str] | None = None,
     num_episodes: int | None = None,
     settings: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
-) -> Tested:
-    """Run test episodes with the run's protocol; nothing in its directory changes.
+) -> Evaluation:
+    """Test a trained run once more, with its protocol; nothing in its directory changes.
 
     Args:
         run_dir: The run directory.
-        groups: `train` or unseen groups; all of them by default.
+        groups: `"train"` or unseen groups; all of them by default.
         num_episodes: Episodes per group; the run's own number by default.
-        settings: Changes of `planner` and `evaluation` settings by dotted name.
+        settings: Changes of `planner` and `evaluation` settings by dotted name, for example
+            `{"planner.num_candidates": 50}`, to test the model with another planner.
         progress: Shown while testing; silent by default.
 
     Raises:
@@ -201,6 +189,7 @@ def run_tests(
         ConfigError: A setting is unknown, of the wrong type or out of range, or one that
             training has fixed.
     """
+    prepare_jax()
     run, changes = RunDir(run_dir), dict(settings or {})
     if num_episodes is not None:
         changes["evaluation.num_episodes"] = num_episodes
@@ -210,9 +199,17 @@ def run_tests(
         groups = known_groups(groups, environments.sim_params.group_names)
         total = len(groups) * config.evaluation.num_episodes * environments.episode_length
         shown.phase("evaluate", total)
-        key = jax.random.key(config.evaluation.seed)
-        tests = evaluate_agent(agent, environments, config, groups, key=key, progress=shown)
-    return Tested(config, run.last_iteration, agent, environments.task, tests)
+        batches = Batches(environments, config, "evaluation", shown.advance, shown.message)
+        tests = run_tests(agent, groups, batches, jax.random.key(config.evaluation.seed))
+    use = tests.use
+    evaluations = use.evaluations / use.steps
+    cost = PlanningCost(
+        evaluations,
+        plan_flop(config.model, config.planner, environments.task, evaluations),
+        use.seconds / use.timed_steps if use.timed_steps else None,
+    )
+    rows = tests.rows(config, run.last_iteration)
+    return Evaluation(rows, config, cost, tests.trajectories)
 
 
 def known_groups(wanted: Sequence[str] | None, known: Sequence[str]) -> list[str]:

@@ -8,9 +8,9 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from headway.config import TOLERANCE, Config, override, setting_names
+from headway.config import TOLERANCE, Config, known_settings, override
 from headway.errors import ConfigError, unknown_name
-from headway.task import EnvSpec, env_spec, sim_param_sets
+from headway.task import EnvSpec, env_options, env_spec, sim_param_sets
 
 Settings = Mapping[str, Any]
 """Values by dotted name."""
@@ -266,7 +266,7 @@ PRESETS: dict[str, Preset] = {preset.name: preset for preset in _PRESETS}
 def register_method(method: Method) -> None:
     """Add a method of your own, or replace an earlier one of the same name.
 
-    Its settings may name a `model.kind` of your own (`register_learner`).
+    Its settings may name a `model.kind` of your own (`register_model`).
 
     Raises:
         ConfigError: It has the name of a built-in method, or its settings are not allowed.
@@ -313,7 +313,7 @@ def make_config(
     config = override(config, PRESETS[preset].settings(spec))
     config = override(config, {**chosen.settings, **chosen.by_preset.get(preset, {})})
     config = override(config, {"seed": seed, **(settings or {})})
-    check_options(config)
+    env_options(config)  # refuses unknown ones
     return config
 
 
@@ -331,9 +331,8 @@ def config_to_evaluate(
     Raises:
         ConfigError: A setting is unknown, of the wrong type or out of range, or may not change.
     """
-    names = setting_names(config)
-    for name in settings:
-        if name in names and name not in TOLERANCE and name.partition(".")[0] not in sections:
+    for name in sorted(set(settings) & set(known_settings()) - set(TOLERANCE)):
+        if name.partition(".")[0] not in sections:
             raise ConfigError(
                 f"{name} cannot change here, allowed: settings of {' and '.join(sections)};"
                 " train another run to change what it is trained with."
@@ -346,15 +345,3 @@ def told_sim_params(config: Config) -> tuple[str, ...]:
     if config.model.context != "sim-params":
         return ()
     return sim_param_sets(config).names
-
-
-def check_options(config: Config) -> None:
-    """Refuse switches that the environment does not have.
-
-    Raises:
-        ConfigError: An option is unknown.
-    """
-    spec = env_spec(config.env)
-    for option in config.env_options:
-        if option not in spec.options:
-            raise ConfigError(str(unknown_name(f"{spec.name} option", option, spec.options)))

@@ -175,14 +175,14 @@ class RunDir:
         """
         if self._is_new():
             versions = {name: importlib.metadata.version(name) for name in VERSIONED}
-            metadata = {
+            values = {
                 "schema": SCHEMA,
                 "config": to_dict(config),
                 "versions": {"python": platform.python_version(), **versions},
                 "device": str(jax.devices()[0].device_kind),
                 "commit": _commit(),
             }
-            write_json(self.path / "config.json", metadata)
+            write_json(self.path / "config.json", values)
         found = differences(tolerating_as(self.config(), config), config)
         if found:
             raise RunError(
@@ -192,8 +192,8 @@ class RunDir:
         self.check()
         self._tidy()
 
-    def metadata(self) -> dict[str, Any]:
-        """The content of `config.json`: settings, versions, device, commit.
+    def config(self) -> Config:
+        """The settings of the run.
 
         Raises:
             RunError: There is no run here, its file is damaged, or of another version.
@@ -203,23 +203,12 @@ class RunDir:
             raise RunError(f"{self.path} is not a directory, allowed: a run directory.")
         with reading(path):
             values = json.loads(path.read_bytes())
-            schema = values["schema"]
-        if schema == SCHEMA:
-            return values
+            if values["schema"] == SCHEMA:
+                return from_dict(values["config"])
         raise RunError(
-            f"{path} has schema {str(schema)[:20]}, allowed: {SCHEMA}; train the run again, or use"
-            " the version of headway that made it."
+            f"{path} has schema {str(values['schema'])[:20]}, allowed: {SCHEMA}; train the run"
+            " again, or use the version of headway that made it."
         )
-
-    def config(self) -> Config:
-        """The settings of the run.
-
-        Raises:
-            RunError: As `metadata`.
-        """
-        values = self.metadata()
-        with reading(self.path / "config.json"):
-            return from_dict(values["config"])
 
     @property
     def finished_iterations(self) -> int:
@@ -250,8 +239,7 @@ class RunDir:
             RunError: A file is damaged or gone; the message says how to go back.
         """
         finished = self.finished_iterations
-        with self._advice():
-            self._check(finished - 1)
+        self._read()
         newest = max(self._numbers("checkpoints"), default=0)
         if newest > finished:
             raise RunError(
@@ -296,8 +284,7 @@ class RunDir:
             RunError: No iteration is finished, or the checkpoint is damaged or of another model.
         """
         name = _name("checkpoints", self.last_iteration)
-        self._checked("config.json")
-        self._checked(name)
+        self._read(["config.json", name])
         return tree_from_arrays(template, load_arrays(self.path / name)[0], self.path / name)
 
     def iteration_data(self, iteration: int) -> list[Trajectory]:
@@ -323,7 +310,7 @@ class RunDir:
         """
         name, found = _name("tests", self.last_iteration), {}
         if name in self._checksums(self.last_iteration):
-            self._checked(name)
+            self._read([name])
             arrays, facts = load_arrays(self.path / name)
             for group, episode in zip(
                 facts["groups"], trajectories_from(arrays, facts), strict=True
@@ -377,7 +364,8 @@ class RunDir:
         """The newest finished iteration whose files are all as they were written."""
         for iteration in reversed(self._numbers("checksums")):
             with contextlib.suppress(RunError):
-                self._check(iteration)
+                for name, digest in self._checksums(iteration).items():
+                    _checked(self.path / name, digest)
                 return iteration
         return None
 
@@ -425,34 +413,21 @@ class RunDir:
         with reading(path):
             return dict(json.loads(path.read_bytes()))
 
-    def _check(self, iteration: int) -> None:
-        for name, digest in self._checksums(iteration).items():
-            _checked(self.path / name, digest)
+    def _read(self, names: Sequence[str] | None = None) -> dict[str, bytes]:
+        """The parts of files that count for the newest iteration, as they were written.
 
-    def _checked(self, name: str) -> bytes:
-        """The part of a file that counts for the newest iteration, as it was written."""
-        with self._advice():
-            known = self._checksums(self.finished_iterations - 1)
-            if name not in known:
-                raise RunError(f"{self.path / name} is not among the run's checksums.")
-            return _checked(self.path / name, known[name])
+        Args:
+            names: Of the files; all that there are by default.
 
-    def _table(self, name: str) -> bytes:
-        return self._checked(name) if self.finished_iterations else b""
-
-    def _rows(self, name: str) -> list[dict[str, Any]]:
-        text = self._table(name).decode()
-        with reading(self.path / name):
-            return [
-                {column: _TYPES.get(column, str)(cell) for column, cell in row.items()}
-                for row in csv.DictReader(io.StringIO(text, newline=""))
-            ]
-
-    @contextlib.contextmanager
-    def _advice(self) -> Iterator[None]:
-        """Add to an error how to go back."""
+        Raises:
+            RunError: One is damaged or gone; the message says how to go back.
+        """
         try:
-            yield
+            known = self._checksums(self.finished_iterations - 1)
+            for name in names or ():
+                if name not in known:
+                    raise RunError(f"{self.path / name} is not among the run's checksums.")
+            return {name: _checked(self.path / name, known[name]) for name in names or known}
         except RunError as error:
             good = self.last_good()
             advice = (
@@ -463,6 +438,17 @@ class RunDir:
                 " --resume-from-last-good goes back to it."
             )
             raise RunError(f"{error} {advice}") from None
+
+    def _table(self, name: str) -> bytes:
+        return self._read([name])[name] if self.finished_iterations else b""
+
+    def _rows(self, name: str) -> list[dict[str, Any]]:
+        text = self._table(name).decode()
+        with reading(self.path / name):
+            return [
+                {column: _TYPES.get(column, str)(cell) for column, cell in row.items()}
+                for row in csv.DictReader(io.StringIO(text, newline=""))
+            ]
 
     def _tidy(self) -> None:
         """Delete what nobody goes back to, and files that were never complete."""

@@ -18,7 +18,6 @@ from scipy import stats
 from headway.data import Trajectory, sim_params_row
 from headway.models.acting import MultiHeadBelief, MultiHeadModel
 from headway.models.base import Transition
-from headway.planning.agent import Agent
 
 LEVELS = (0.5, 0.9, 0.95)  # central intervals that are counted
 
@@ -40,16 +39,6 @@ class EpisodeSelection:
     def best(self) -> Int[np.ndarray, " member"]:
         """The head that would have been best for the whole episode, in hindsight."""
         return self.errors.sum(0).argmin(-1)
-
-    @property
-    def chosen_errors(self) -> Float[np.ndarray, "step member"]:
-        """The errors of the selected heads."""
-        return np.take_along_axis(self.errors, self.chosen[..., None], axis=-1)[..., 0]
-
-    @property
-    def best_errors(self) -> Float[np.ndarray, "step member"]:
-        """The errors of the best head in hindsight."""
-        return np.take_along_axis(self.errors, self.best[None, :, None], axis=-1)[..., 0]
 
     def settling(self, window: int) -> Float[np.ndarray, " member"]:
         """Transitions that are seen before the best head is chosen `window` times in a row.
@@ -104,39 +93,32 @@ class SelectionSummary:
 
 
 def examine(
-    agent: Agent, trajectories: Sequence[Trajectory], *, key: PRNGKeyArray
+    model: MultiHeadModel, trajectories: Sequence[Trajectory], *, key: PRNGKeyArray
 ) -> list[EpisodeSelection]:
     """Predict every transition of some episodes with every head, as the agent would have.
 
     Args:
-        agent: The agent whose model and selection are examined.
+        model: The agent's, with its selection of heads.
         trajectories: The episodes; those of a single transition are left out.
         key: Draws of a selection that is random or sampled.
     """
-    chosen = [trajectory for trajectory in trajectories if len(trajectory) > 1]
-    longest = max((len(trajectory) for trajectory in chosen), default=0)
-    assert isinstance(agent.model, MultiHeadModel)
-    return [
-        _examine(agent.model, trajectory, longest, jax.random.fold_in(key, i))
-        for i, trajectory in enumerate(chosen)
-    ]
-
-
-def _examine(
-    model: MultiHeadModel, trajectory: Trajectory, longest: int, key: PRNGKeyArray
-) -> EpisodeSelection:
-    steps, told, names = len(trajectory), None, model.sim_param_names
-    padding = ((0, longest - steps), (0, 0))
-    obs = jnp.asarray(np.pad(trajectory.obs, padding, "edge"))
-    action = jnp.asarray(np.pad(trajectory.action, padding, "edge"))
-    if names:
-        told = jnp.asarray(sim_params_row(trajectory.sim_params, names))[None]
-    found = _predict(model, obs, action, told, key)
-    errors, chosen, deviations = jax.tree.map(lambda x: np.asarray(x)[1:steps], found)
-    if deviations is not None:
-        varies = np.asarray(model.statistics.delta.std) > 0
-        deviations = deviations[..., varies]
-    return EpisodeSelection(trajectory.sim_params, errors, chosen, deviations)
+    episodes = [trajectory for trajectory in trajectories if len(trajectory) > 1]
+    longest = max((len(trajectory) for trajectory in episodes), default=0)
+    varies = np.asarray(model.statistics.delta.std) > 0
+    found = []
+    for i, trajectory in enumerate(episodes):
+        steps, told, names = len(trajectory), None, model.sim_param_names
+        padding = ((0, longest - steps), (0, 0))
+        obs = jnp.asarray(np.pad(trajectory.obs, padding, "edge"))
+        action = jnp.asarray(np.pad(trajectory.action, padding, "edge"))
+        if names:
+            told = jnp.asarray(sim_params_row(trajectory.sim_params, names))[None]
+        arrays = _predict(model, obs, action, told, jax.random.fold_in(key, i))
+        errors, chosen, deviations = (x if x is None else np.asarray(x)[1:steps] for x in arrays)
+        if deviations is not None:
+            deviations = deviations[..., varies]
+        found.append(EpisodeSelection(trajectory.sim_params, errors, chosen, deviations))
+    return found
 
 
 @eqx.filter_jit
@@ -184,27 +166,26 @@ def summarise(episodes: Sequence[EpisodeSelection], window: int) -> SelectionSum
         window: Right selections in a row after which selection has settled.
     """
     errors = np.concatenate([episode.errors for episode in episodes])
+    chosen = [np.take_along_axis(e.errors, e.chosen[..., None], -1) for e in episodes]
+    best = [np.take_along_axis(e.errors, e.best[None, :, None], -1) for e in episodes]
     settling = np.concatenate([episode.settling(window) for episode in episodes])
     settled = ~np.isnan(settling)
     wrong = np.concatenate([episode.chosen != episode.best for episode in episodes])
+    calibration = None
+    seen = [e.deviations.ravel() for e in episodes if e.deviations is not None]
+    if seen:
+        deviations = np.abs(np.concatenate(seen).astype(np.float64))
+        bounds = {level: stats.norm.ppf(0.5 + level / 2) for level in LEVELS}
+        inside = {level: float((deviations <= bound).mean()) for level, bound in bounds.items()}
+        calibration = Calibration(float(np.square(deviations).mean()), inside)
     return SelectionSummary(
         len(episodes),
         errors.mean(0),
-        float(np.concatenate([episode.chosen_errors for episode in episodes]).mean()),
-        float(np.concatenate([episode.best_errors for episode in episodes]).mean()),
+        float(np.concatenate(chosen).mean()),
+        float(np.concatenate(best).mean()),
         float(errors.mean()),
         float(wrong.mean()),
         float(np.median(settling[settled])) if settled.any() else None,
         float(settled.mean()),
-        _calibration(episodes),
+        calibration,
     )
-
-
-def _calibration(episodes: Sequence[EpisodeSelection]) -> Calibration | None:
-    found = [e.deviations.ravel() for e in episodes if e.deviations is not None]
-    if not found:
-        return None
-    deviations = np.abs(np.concatenate(found).astype(np.float64))
-    bounds = {level: stats.norm.ppf(0.5 + level / 2) for level in LEVELS}
-    inside = {level: float((deviations <= bound).mean()) for level, bound in bounds.items()}
-    return Calibration(float(np.square(deviations).mean()), inside)

@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -15,21 +15,20 @@ from headway.data import Trajectory
 from headway.errors import DivergenceError
 from headway.models.fitting import EpochStats
 from headway.training.collect import (
-    AgentPolicy,
+    Batches,
     Environments,
     Episode,
-    InvalidEpisodes,
+    Policy,
     Rollout,
+    agent_policy,
     random_policy,
-    run_episodes,
 )
-from headway.training.evaluate import Tests, evaluate_agent
+from headway.training.evaluate import Tests, run_tests
 from headway.training.files import tree_arrays, tree_from_arrays
-from headway.training.learners import Learned, make_learner
-from headway.training.loading import initial, load_learned
 from headway.training.progress import Progress
 from headway.training.run import Partial, RunDir
 from headway.training.stopping import StopRequest, stop_requests
+from headway.training.trainers import make_trainer
 
 SAVE_EVERY = 30.0  # seconds between two writes of an unfinished fit
 MAX_SKIPPED = 0.5
@@ -40,20 +39,6 @@ SLOWER = 0.25
 """Factor on the step size with every roll-back."""
 MANY_MAPS = 30_000
 """Half of the memory maps that Linux allows a process."""
-
-
-class Keys(NamedTuple):
-    """The random streams of one iteration, derived from the seed and the iteration alone."""
-
-    collect: PRNGKeyArray
-    fit: PRNGKeyArray
-    evaluate: PRNGKeyArray
-    diagnose: PRNGKeyArray
-
-    @classmethod
-    def of(cls, seed: int, iteration: int) -> "Keys":
-        """Independent of how often the run was interrupted before."""
-        return cls(*jax.random.split(jax.random.fold_in(jax.random.key(seed), iteration + 1), 4))
 
 
 def train_run(
@@ -121,28 +106,30 @@ class _Training:
     ):
         self.config, self.run, self.environments = config, run, environments
         self.progress, self.stop = progress, stop
-        self.learner = make_learner(config, environments.task)
+        self.trainer = make_trainer(config, environments)
         self.data = run.load_data() if config.model.learns else []
-        begun = run.finished_iterations > 0
-        self.learned = load_learned(run, config) if begun else initial(config, environments.task)
+        self.state = self.trainer.load(run) if run.finished_iterations else self.trainer.begin()
 
     def train(self) -> None:
         """Go through the iterations that are left; only the last write makes one count."""
-        config, run, learner = self.config, self.run, self.learner
+        config, run, trainer = self.config, self.run, self.trainer
         todo = range(run.finished_iterations, config.collection.num_iterations)
         for iteration in todo:
-            partial, keys = run.partial(), Keys.of(config.seed, iteration)
+            partial = run.partial()
+            # From seed and iteration alone, however often the run was interrupted before.
+            key = jax.random.fold_in(jax.random.key(config.seed), iteration + 1)
+            collect_key, fit_key, test_key, error_key = jax.random.split(key, 4)
             metrics: dict[str, Any] = {"iteration": iteration}
             collected: list[Trajectory] = []
             seconds = {}
             if config.model.learns:
-                rollout = self.collect(iteration, keys.collect, partial)
-                collected, seconds["collect"] = rollout.trajectories, rollout.seconds
+                rollout = self.collect(iteration, collect_key, partial)
+                collected, seconds["collect"] = list(rollout.episodes.values()), rollout.seconds
                 self.data += collected
                 failures = {"planner_failures": rollout.use.failures}
                 metrics["collection"] = _summary(collected) | failures
-                metrics["fitting"], seconds["fit"] = self.fit(iteration, keys.fit, partial)
-            tests = self.evaluate(iteration, keys.evaluate, partial)
+                metrics["fitting"], seconds["fit"] = self.fit(iteration, fit_key, partial)
+            tests = self.evaluate(iteration, test_key, partial)
             seconds["evaluate"] = tests.seconds
             tested = tests.trajectories
             metrics |= {
@@ -152,10 +139,10 @@ class _Training:
                 "seconds": {name: round(value, 3) for name, value in seconds.items()},
             }
             errors = {
-                group: learner.prediction_error(self.learned, found, keys.diagnose)
+                group: trainer.prediction_error(self.state, found, error_key)
                 for group, found in tested.items()
             }
-            shares = learner.head_shares(self.learned, self.data)
+            shares = trainer.head_shares(self.state, self.data)
             tables = {
                 "evaluation.csv": [row.to_csv() for row in tests.rows(config, iteration)],
                 "assignments.csv": [{"iteration": iteration, **row} for row in shares],
@@ -165,7 +152,7 @@ class _Training:
                     for step, error in enumerate(found, start=1)
                 ],
             }
-            run.save_iteration(metrics, self.learned, collected, tested, tables)
+            run.save_iteration(metrics, self.state, collected, tested, tables)
             partial.remove()
             self.progress.iteration_done(metrics)
             self.stop.answer()
@@ -193,30 +180,28 @@ class _Training:
 
     def collect(self, iteration: int, key: PRNGKeyArray, partial: Partial) -> Rollout:
         """Run one episode in each environment, under physics drawn from the training set."""
-        config, environments = self.config.collection, self.environments
-        steps = config.num_episodes * environments.episode_length
-        self.begin_phase(iteration, "collect", steps)
-        kept = partial.load("collect")
-        if kept is not None:
-            self.progress.advance(steps)
-            return Rollout.from_part(*kept)
+        environments, count = self.environments, self.config.collection.num_episodes
+        self.begin_phase(iteration, "collect", count * environments.episode_length)
         rng = np.random.default_rng([self.config.seed, iteration])
-        seeds = rng.integers(2**31 - 1, size=config.num_episodes)
+        seeds = rng.integers(2**31 - 1, size=count)
         episodes = [Episode(environments.sim_params.sample(rng), int(seed)) for seed in seeds]
-        if iteration == 0:
-            policy = random_policy(environments, rng)
-        else:
-            agent = self.learner.agent(self.learned, environments, self.data)
-            policy = AgentPolicy(agent, config.num_episodes, episodes, key=key)
-        rollout = run_episodes(environments, episodes, policy, self.on_step)
-        invalid = InvalidEpisodes(
-            "collection.max_bad_episodes", config.max_bad_episodes, self.progress.message
-        )
-        invalid.leave_out(rollout)
-        if not rollout.trajectories:
-            raise invalid.too_many()
-        partial.save("collect", *rollout.to_part())
+
+        def policy() -> Policy:
+            if iteration == 0:
+                return random_policy(environments, rng)
+            agent = self.trainer.agent(self.state, self.data)
+            return agent_policy(agent, count, episodes, key=key)
+
+        batches = self.batches("collection", partial)
+        rollout = batches.run("collect", episodes, policy)
+        if not rollout.episodes:
+            raise batches.too_many()
         return rollout
+
+    def batches(self, phase: Literal["collection", "evaluation"], partial: Partial) -> Batches:
+        """Run the episodes of a phase."""
+        say = self.progress.message
+        return Batches(self.environments, self.config, phase, self.on_step, say, partial)
 
     def fit(
         self, iteration: int, key: PRNGKeyArray, partial: Partial
@@ -233,57 +218,51 @@ class _Training:
             DivergenceError: It diverged again and again.
         """
         self.begin_phase(iteration, "fit", self.config.fitting.epochs)
-        state, rollbacks, seconds = self.learned.fit, 0, 0.0
+        rollbacks, seconds = 0, 0.0
         history: list[EpochStats] = []
         kept = partial.load("fit")
         if kept is not None:
             arrays, facts = kept
-            state = tree_from_arrays(state, arrays, partial.path("fit"))
+            self.state = tree_from_arrays(self.state, arrays, partial.path("fit"))
             history = [EpochStats(*row) for row in facts["history"]]
             rollbacks, seconds = facts["rollbacks"], facts["seconds"]
             self.progress.advance(len(history))
         started = saved = time.perf_counter()
-        problem, learner = None, self.learner
 
         def save() -> None:
             rows = [[x.item() for x in map(np.asarray, epoch)] for epoch in history]
             facts = {"history": rows, "rollbacks": rollbacks}
             facts["seconds"] = seconds + time.perf_counter() - started
-            partial.save("fit", tree_arrays(state), facts)
+            partial.save("fit", tree_arrays(self.state), facts)
 
-        while True:
-            if rollbacks:
-                rate = max(1e-12, SLOWER**rollbacks * self.config.fitting.learning_rate)
-                slower = override(self.config, {"fitting.learning_rate": rate})
-                learner = make_learner(slower, self.environments.task)
-            fit = learner.fit(self.data, iteration, key)
-            for fitted, stats in fit.epochs(state, len(history)):
+        while len(history) < self.config.fitting.epochs:
+            rate = max(1e-12, SLOWER**rollbacks * self.config.fitting.learning_rate)
+            trainer = make_trainer(override(self.config, {"fitting.learning_rate": rate}))
+            problem = None
+            for state, stats in trainer.fit(self.state, self.data, iteration, key, len(history)):
                 problem = divergence(stats, history)
                 if problem is not None:
                     break
-                state = fitted
+                self.state = state
                 history.append(stats)
                 self.progress.advance(1, loss=float(stats.loss))
                 if self.stop or time.perf_counter() - saved >= SAVE_EVERY:
                     save()
                     saved = time.perf_counter()
                 self.stop.answer()
-            self.learned = Learned(state, fit.statistics)
             if problem is None:
                 break
             rollbacks += 1
             epoch = f"epoch {len(history)} of iteration {iteration}"
             if rollbacks > self.config.fitting.max_rollbacks:
-                where = first_non_finite(
-                    self.data, self.learner.head_losses(self.learned, self.data)
-                )
+                losses = trainer.head_losses(self.state, self.data)
                 raise DivergenceError(
-                    f"{epoch} diverged {rollbacks} times: {problem} ({where}), allowed:"
+                    f"{epoch} diverged {rollbacks} times: {problem}"
+                    f" ({first_non_finite(self.data, losses)}), allowed:"
                     f" fitting.max_rollbacks ({rollbacks - 1}); try a smaller"
                     " fitting.learning_rate in another directory."
                 )
             self.progress.message(f"{epoch}: {problem}; made again with a smaller step.")
-            problem = None
         save()
         measured = {
             "loss": float(history[-1].loss),
@@ -302,16 +281,8 @@ class _Training:
             return Tests()
         num_tests = len(groups) * self.config.evaluation.num_episodes
         self.begin_phase(iteration, "evaluate", num_tests * self.environments.episode_length)
-        return evaluate_agent(
-            self.learner.agent(self.learned, self.environments, self.data),
-            self.environments,
-            self.config,
-            groups,
-            key=key,
-            progress=self.progress,
-            on_step=self.on_step,
-            partial=partial,
-        )
+        agent = self.trainer.agent(self.state, self.data)
+        return run_tests(agent, groups, self.batches("evaluation", partial), key)
 
 
 def divergence(stats: EpochStats, before: Sequence[EpochStats]) -> str | None:
