@@ -15,7 +15,6 @@ from headway.errors import BadEnvironmentError
 from headway.sim_params import SimParamSets
 from headway.task import EnvSpec, register
 from headway.training.collect import Environments, Episode, random_policy, run_episodes
-from headway.training.methods import make_config
 from headway.training.run import RunDir
 from headway.training.train import train_run
 
@@ -54,22 +53,6 @@ def sound(tmp_path_factory):
         return runs.result(path)
 
     return result
-
-
-def test_episodes_follow_their_own_schedules():
-    environments = Environments.make(make_config("pendulum", preset="smoke"))
-    length = {"length": 1.0, "mass": 1.0}
-    plain, changing = Episode(length, 1), Episode(length, 1, {5: {"length": 0.3}})
-
-    def roll_out(*episodes):
-        policy = random_policy(environments, np.random.default_rng(0))
-        found = run_episodes(environments, episodes, policy).episodes
-        return [t.obs for t in found.values()]
-
-    (first, second), (same, changed) = roll_out(plain, plain), roll_out(plain, changing)
-    np.testing.assert_array_equal(first, same)
-    np.testing.assert_array_equal(second[:6], changed[:6])
-    assert (second[6:] != changed[6:]).any(-1).all()
 
 
 def test_a_run_with_processes_equals_one_without(reference, tmp_path):

@@ -114,9 +114,8 @@ def examine(
         if names:
             told = jnp.asarray(sim_params_row(trajectory.sim_params, names))[None]
         arrays = _predict(model, obs, action, told, jax.random.fold_in(key, i))
-        errors, chosen, deviations = (x if x is None else np.asarray(x)[1:steps] for x in arrays)
-        if deviations is not None:
-            deviations = deviations[..., varies]
+        errors, chosen = (np.asarray(array)[1:steps] for array in arrays[:2])
+        deviations = None if arrays[2] is None else np.asarray(arrays[2])[1:steps, :, varies]
         found.append(EpisodeSelection(trajectory.sim_params, errors, chosen, deviations))
     return found
 
