@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import headway
-import misbehaving
 import runs
 from headway import task
 from headway.envs.classic import PendulumTask
@@ -145,16 +144,26 @@ def test_what_cannot_be_trusted_stops_the_run_with_the_reason(
     assert runs.result(tmp_path / "run") == wanted
 
 
-@pytest.mark.parametrize(("how", "length"), [("end", 1), ("cut", 1), ("count", 6)])
-def test_episodes_that_end_at_once_and_other_kinds_of_numbers_are_used(
-    how, length, drift, tmp_path
+@pytest.mark.parametrize(
+    ("how", "at", "named", "lengths"),
+    [
+        ("end", 1, {}, {1}),
+        ("cut", 1, {}, {1}),
+        ("count", 1, {}, {6}),
+        ("end", 3, {"drift": 1.0}, {3, 6}),
+    ],
+)
+def test_episodes_that_end_early_and_other_kinds_of_numbers_are_learned_from(
+    how, at, named, lengths, drift, tmp_path
 ):
     """Whole numbers are numbers; and one transition is an episode, to learn from and to test."""
-    drift(how, at=1)
-    run = train_run(config(), tmp_path / "run")
-    assert {len(t) for t in run.load_data()} == {length}
-    assert {row.length for row in run.evaluation()} == {length}
-    assert {t.terminated for t in run.load_data()} == {how == "end"}
+    drift(how, at=at, **named)
+    run = train_run(config(**{"collection.num_episodes": 4}), tmp_path / "run")
+    data = run.load_data()
+    assert {len(t) for t in data} == lengths
+    assert {row.length for row in run.evaluation()} == lengths
+    assert all(t.terminated == (how == "end" and len(t) == at) for t in data)
+    assert run.metrics()[-1]["fitting"]["transitions"] == sum(map(len, data))
     assert all(np.isfinite(row["fitting"]["loss"]) for row in run.metrics())
 
 
@@ -179,13 +188,3 @@ def test_an_episode_that_mujoco_gives_up_is_left_out(tmp_path, monkeypatch):
     assert "the simulation of half-cheetah diverged" in found.invalid[1]
     assert {number: len(t) for number, t in found.episodes.items()} == {0: 4, 2: 4}
     environments.close()
-
-
-def test_the_environment_that_misbehaves_is_sound_when_it_does_not():
-    """Else the tests above would test something else."""
-    env = misbehaving.Drift()
-    first, _ = env.reset(seed=1, options={"sim_params": {"drift": 2.0}})
-    obs, reward, ends, cut, _ = env.step(np.ones(1, np.float32))
-    assert env.observation_space.contains(obs)
-    assert (reward, ends, cut) == (1.0, False, False)
-    assert (obs != first).all()

@@ -4,6 +4,7 @@ import dataclasses
 
 import pytest
 
+from headway.config import Config
 from headway.errors import ConfigError, UnknownNameError
 from headway.planning.flop import plan_flop
 from headway.task import env_names, env_spec
@@ -21,22 +22,9 @@ def test_every_combination_is_a_valid_configuration(env, preset, method):
     assert (config.env, config.method, config.preset) == (env, method, preset)
 
 
-def test_paper_preset_has_the_supplements_numbers():
-    config = make_config("half-cheetah")
-    planner, fitting, collection = config.planner, config.fitting, config.collection
-    assert (planner.num_candidates, planner.num_iterations, planner.horizon) == (200, 5, 30)
-    assert (planner.num_particles, planner.selection_length) == (20, 10)
-    assert (config.model.num_members, config.model.num_heads) == (5, 3)
-    assert config.model.hidden_sizes == (200, 200, 200, 200)
-    assert (fitting.segment_length, fitting.warmup_iterations, fitting.learning_rate) == (
-        10,
-        3,
-        1e-3,
-    )
-    assert (collection.num_iterations, collection.num_episodes) == (10, 10)
-    assert fitting.epochs == 50
+def test_paper_preset_is_the_defaults_and_the_environments_epochs():
+    assert make_config("half-cheetah") == Config("half-cheetah")
     assert make_config("pendulum").fitting.epochs == 5
-    assert not fitting.bootstrap
 
 
 @pytest.mark.parametrize("method", ["tmcl", "pets"])
@@ -51,14 +39,26 @@ def test_fast_preset_plans_with_a_tenth_of_the_papers_arithmetic_and_changes_not
     assert dataclasses.replace(fast, preset="paper", planner=paper.planner) == paper
 
 
+@pytest.mark.parametrize(
+    ("method", "preset", "sizes"),
+    [
+        ("grbal", "paper", (512, 512, 512)),
+        ("grbal", "quick", (128, 128, 128)),
+        ("rebal", "paper", (256,)),
+        ("rebal", "quick", (128,)),
+    ],
+)
+def test_sizes_are_the_papers_at_its_scale_and_smaller_in_smaller_presets(method, preset, sizes):
+    assert make_config("pendulum", method=method, preset=preset).model.hidden_sizes == sizes
+
+
 def test_released_code_preset_flips_the_choices_that_differ():
     config = make_config("hopper", preset="released-code")
-    assert config.fitting.bootstrap
-    assert config.fitting.drop_first_anchor
-    assert not config.fitting.context_weight_decay
-    assert config.planner.selection_error == "sampled"
-    assert config.planner.selection_skips_newest
-    assert config.planner.reward == "released"
+    fitting, planner = config.fitting, config.planner
+    assert (fitting.bootstrap, fitting.drop_first_anchor) == (True, True)
+    assert not fitting.context_weight_decay
+    assert (planner.selection_error, planner.reward) == ("sampled", "released")
+    assert planner.selection_skips_newest
     assert config.env_options == {"observe_average_velocity": False}
 
 

@@ -1,45 +1,23 @@
-"""Methods that differ in the model: their settings, smoke runs, resuming, and what they learn."""
+"""What methods that differ in the model are told, and what they learn of it."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import headway
-import headway.envs
 from headway.data import Trajectory
 from headway.models.multi_headed import network_input
-from headway.training import train
 from headway.training.methods import make_config, told_sim_params
 from headway.training.trainers import make_trainer
 
-NEW = ("stacked", "cadm", "pets-cadm", "oracle-params", "ria")
-TINY = {"collection.episode_length": 12, "fitting.epochs": 1}
-
 
 def test_only_oracle_params_is_told_the_physics():
-    told = {name: told_sim_params(make_config("pendulum", method=name)) for name in NEW}
+    told = {name: told_sim_params(make_config("pendulum", method=name)) for name in headway.METHODS}
     assert told.pop("oracle-params") == ("length", "mass")
     assert set(told.values()) == {()}
     own = headway.SimParamSets({"mass": (1.0,), "length": (0.5, 1.0)})
     config = make_config("pendulum", method="oracle-params", settings={"sim_params": own})
     assert told_sim_params(config) == ("mass", "length")
-
-
-NO_CONTEXT = {"model.context_size": 0, "model.backward_net": False}
-ABLATIONS = [
-    ("tmcl", {**NO_CONTEXT, "fitting.segment_length": 5, "model.num_heads": 2}),
-    ("mh-pets", {"planner.head_selection": "adaptive", "planner.selection_length": 3}),
-]
-
-
-@pytest.mark.parametrize(("method", "settings"), ABLATIONS, ids=str)
-def test_ablations_of_the_supplement_are_settings(method, settings, tmp_path):
-    tiny = {"collection.episode_length": 8, "fitting.epochs": 1, "planner.num_iterations": 1}
-    config = make_config("pendulum", method=method, preset="smoke", settings={**tiny, **settings})
-    metrics = train.train_run(config, tmp_path / "run").metrics()
-    assert np.isfinite([m["fitting"]["loss"] for m in metrics]).all()
-    assert len(metrics) == 2
 
 
 def masses(num_episodes, steps=30, seed=0):
@@ -55,25 +33,23 @@ def masses(num_episodes, steps=30, seed=0):
     return trajectories
 
 
+FITTED = {
+    "model.num_members": 1,
+    "model.deterministic": True,
+    "model.hidden_sizes": (32, 32),
+    "planner.num_particles": 1,
+    "fitting.learning_rate": 5e-3,
+    "fitting.batch_size": 64,
+    "fitting.epochs": 60,
+    "collection.num_episodes": 30,
+    "collection.episode_length": 30,
+    "model.history_length": 5,
+}
+
+
 def fitted_error(method):
     """Squared error of the speed's change on new episodes, in its own variance."""
-    config = make_config(
-        "pendulum",
-        method=method,
-        preset="smoke",
-        settings={
-            "model.num_members": 1,
-            "model.deterministic": True,
-            "model.hidden_sizes": (32, 32),
-            "planner.num_particles": 1,
-            "fitting.learning_rate": 5e-3,
-            "fitting.batch_size": 64,
-            "fitting.epochs": 60,
-            "collection.num_episodes": 30,
-            "collection.episode_length": 30,
-            "model.history_length": 5,
-        },
-    )
+    config = make_config("pendulum", method=method, preset="smoke", settings=FITTED)
     trainer = make_trainer(config)
     *_, (state, _) = trainer.fit(trainer.begin(), masses(40), 0, jax.random.key(0))
     model, statistics = state.fit.model, state.statistics

@@ -11,7 +11,7 @@ from headway.errors import ConfigError
 from headway.lab.figures import save_run_figures
 from headway.models.simulator import ClassicSimulator, RobotSimulator
 from headway.planning.rollouts import candidate_returns
-from headway.task import env_action, env_names, env_spec
+from headway.task import env_action, env_spec
 from headway.training.collect import Environments
 from headway.training.methods import make_config
 from headway.training.trainers import make_trainer
@@ -133,63 +133,46 @@ def test_a_robot_that_mujoco_gives_up_on_ranks_last():
     assert not np.isfinite(simulator.returns(candidates)).any()
 
 
-@pytest.mark.parametrize("env", env_names())
-def test_smoke_run_of_the_simulator_is_only_a_test(env, tmp_path):
-    run = headway.train(
-        env, method="true-dynamics", preset="smoke", run_dir=tmp_path, settings=SMALL | SHORT
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run on the simulator, which needs no fit."""
+    path = tmp_path_factory.mktemp("true-dynamics") / "run"
+    return headway.train(
+        "pendulum", method="true-dynamics", preset="smoke", run_dir=path, settings=SMALL | SHORT
     )
-    groups = env_spec(env).sim_params.group_names
+
+
+def test_a_run_on_the_simulator_is_a_test_and_can_be_tested_again(run):
+    groups = env_spec("pendulum").sim_params.group_names
     assert [row.group for row in run.evaluation] == [g for g in groups for _ in range(2)]
     assert [metrics["timesteps"] for metrics in run.metrics] == [0]
     assert [path.name for path in save_run_figures(run.path)] == ["evaluation.png"]
-
-
-def test_a_run_on_the_simulator_can_be_tested_again(tmp_path):
-    headway.train(
-        "pendulum", method="true-dynamics", preset="smoke", run_dir=tmp_path, settings=SMALL | SHORT
-    )
-    again = headway.evaluate(tmp_path, groups=["train"], num_episodes=1)
+    again = headway.evaluate(run.path, groups=["train"], num_episodes=1)
     assert len(again) == 1
     assert (again.cost.evaluations_per_step, again.cost.flop_per_step) == (2 * 6, 0)
 
 
-def test_the_simulator_beats_random_actions(tmp_path):
-    settings = {
+def test_a_run_on_the_simulator_has_no_controller_to_load(run):
+    with pytest.raises(ConfigError, match=r"no controller of its own, allowed:"):
+        headway.load(run.path)
+
+
+def test_random_actions_are_uniform_within_bounds_and_the_simulator_beats_them(tmp_path):
+    search = {
         "planner.horizon": 15,
         "planner.num_candidates": 60,
         "planner.optimizer.num_elites": 10,
     }
     longer = {"collection.episode_length": 100, "collection.num_episodes": 8}
     returns = {}
-    for method, changes in (("random", longer), ("true-dynamics", settings | longer)):
+    for method, settings in (("random", longer), ("true-dynamics", search | longer)):
         run = headway.train(
-            "pendulum", method=method, preset="smoke", run_dir=tmp_path / method, settings=changes
+            "pendulum", method=method, preset="smoke", run_dir=tmp_path / method, settings=settings
         )
         returns[method] = np.mean([row.episode_return for row in run.evaluation])
     assert returns["true-dynamics"] > 0.6 * returns["random"]  # both are negative
-
-
-def test_random_actions_are_uniform_within_bounds_and_have_no_heads(tmp_path):
-    headway.train("pendulum", method="random", preset="smoke", run_dir=tmp_path, settings=SHORT)
-    controller = headway.load(tmp_path)
+    controller = headway.load(tmp_path / "random")
     actions = np.array([controller.act(np.zeros(3))[0] for _ in range(400)])
-    assert controller.heads is None
     assert np.abs(actions).max() <= 2.0
     assert abs(actions.mean()) < 0.2
     np.testing.assert_allclose(actions.std(), 2 / np.sqrt(3), rtol=0.1)
-
-
-def test_a_run_on_the_simulator_has_no_controller_to_load(tmp_path):
-    headway.train(
-        "pendulum", method="true-dynamics", preset="smoke", run_dir=tmp_path, settings=SHORT
-    )
-    with pytest.raises(ConfigError, match=r"no controller of its own, allowed:"):
-        headway.load(tmp_path)
-
-
-def test_the_simulator_wants_one_particle_and_the_reward_that_is_paid():
-    with pytest.raises(ConfigError, match=r"num_particles is 2, allowed: 1"):
-        make_config("pendulum", method="true-dynamics", settings={"planner.num_particles": 2})
-    with pytest.raises(ConfigError, match=r"planner\.reward is 'released', allowed: task"):
-        make_config("pendulum", method="true-dynamics", settings={"planner.reward": "released"})
-    assert make_config("pendulum", method="true-dynamics", preset="released-code")
