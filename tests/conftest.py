@@ -46,25 +46,28 @@ def forget_compiled_programs():
         jax.clear_caches()
 
 
-class _StoppingAfterTwo(runs.Progress):
+class _Copying(runs.Progress):
+    """Copies a run after two iterations."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
     def iteration_done(self, metrics):
         if metrics["iteration"] == 1:
-            raise KeyboardInterrupt
+            shutil.copytree(self.path, self.path.with_name("two"))
 
 
 @pytest.fixture(scope="session")
 def reference(tmp_path_factory) -> Path:
     """A tiny run that was never stopped; only to be read."""
-    return train_run(runs.tiny_config(), tmp_path_factory.mktemp("reference") / "run").path
+    path = tmp_path_factory.mktemp("reference") / "run"
+    return train_run(runs.tiny_config(), path, _Copying(path)).path
 
 
 @pytest.fixture(scope="session")
-def two_iterations(tmp_path_factory) -> Path:
-    """The same run, stopped after two of three iterations; only to be read."""
-    path = tmp_path_factory.mktemp("two") / "run"
-    with pytest.raises(KeyboardInterrupt):
-        train_run(runs.tiny_config(), path, _StoppingAfterTwo())
-    return path
+def two_iterations(reference) -> Path:
+    """The same run after two of three iterations; only to be read."""
+    return reference.with_name("two")
 
 
 @pytest.fixture

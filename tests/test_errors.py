@@ -21,20 +21,20 @@ def test_every_error_is_a_headway_error_and_a_builtin_one(kind, builtin):
     assert str(kind("one line")) == "one line"
 
 
-def test_an_unknown_name_where_there_are_none_says_so():
-    assert str(errors.unknown_name("pendulum option", "foo", [])) == (
-        "unknown pendulum option 'foo'. There is none; leave it out."
-    )
-
-
-def test_an_unknown_name_suggests_the_closest_and_lists_all():
-    error = errors.unknown_name("environment", "pendulm", ["hopper", "pendulum"])
+@pytest.mark.parametrize(
+    ("kind", "got", "names", "text"),
+    [
+        ("option", "foo", [], "unknown option 'foo'. There is none; leave it out."),
+        ("method", "zzz", ["tmcl", "pets"], "unknown method 'zzz'. Allowed: pets, tmcl."),
+        (
+            "env",
+            "peg",
+            ["pets", "peg2"],
+            "unknown env 'peg'. Did you mean 'peg2'? Allowed: peg2, pets.",
+        ),
+    ],
+)
+def test_an_unknown_name_lists_all_and_suggests_the_closest(kind, got, names, text):
+    error = errors.unknown_name(kind, got, iter(names))
     assert isinstance(error, errors.UnknownNameError)
-    assert str(error) == (
-        "unknown environment 'pendulm'. Did you mean 'pendulum'? Allowed: hopper, pendulum."
-    )
-
-
-def test_a_name_like_no_other_gets_no_suggestion():
-    text = str(errors.unknown_name("method", "zzz", iter(["tmcl", "pets"])))
-    assert text == "unknown method 'zzz'. Allowed: pets, tmcl."
+    assert str(error) == text

@@ -517,32 +517,31 @@ class List(Command):
 
         entries: list[dict[str, Any]] = []
         if self.what == "envs":
-            table = new_table("Environments", "name", "what varies", "training", "unseen")
+            texts = ("name", "what varies", "training", "unseen", "options")
+            table = new_table("Environments", *texts, numbers=("obs", "action", "steps"))
             table.columns[0].no_wrap = True
-            for name in ("obs", "action", "steps"):
-                table.add_column(name, justify="right")
-            table.add_column("options", overflow="fold")
             for spec in map(env_spec, env_names()):
                 task, sets = spec.make_task(**spec.options), spec.sim_params
                 groups = {name: list(map(dict, sets.group(name))) for name in sets.group_names}
-                sizes = {
+                entry = {
+                    "name": spec.name,
+                    "id": spec.env_id,
+                    "description": spec.description,
                     "obs_size": task.obs_size,
                     "action_size": task.action_size,
                     "episode_length": spec.episode_length,
+                    "sim_params": groups,
+                    "options": dict(spec.options),
                 }
-                entries.append(
-                    {"name": spec.name, "id": spec.env_id, "description": spec.description}
-                    | sizes
-                    | {"sim_params": groups, "options": dict(spec.options)}
-                )
+                entries.append(entry)
                 names = varying([physics for group in groups.values() for physics in group])
                 train, *unseen = (
                     ", ".join(value_label(physics, names) for physics in group)
                     for group in groups.values()
                 )
                 cells = [spec.name, axis_label(names), train, "\n".join(unseen)]
-                options = "\n".join(spec.options) or "–"
-                table.add_row(*cells, *map(str, sizes.values()), options)
+                sizes = map(str, (task.obs_size, task.action_size, spec.episode_length))
+                table.add_row(*cells, "\n".join(spec.options) or "–", *sizes)
         elif self.what == "methods":
             table = new_table("Methods", "name", "description", "settings that differ from tmcl")
             usual = flatten(to_dict(Config(env="pendulum")))

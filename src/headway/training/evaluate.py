@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import jax
 import numpy as np
@@ -79,11 +79,7 @@ class Evaluation(Sequence[EpisodeRow]):
     trajectories: Mapping[str, list[Trajectory]] = dataclasses.field(default_factory=dict)
     """The same episodes step by step, by group."""
 
-    @overload
-    def __getitem__(self, index: int) -> EpisodeRow: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[EpisodeRow]: ...
-    def __getitem__(self, index):
+    def __getitem__(self, index: Any) -> Any:
         return self.rows[index]
 
     def __len__(self) -> int:

@@ -1,12 +1,10 @@
-"""Files that are whole or not there: bytes, JSON, CSV, arrays; read with one line where damaged."""
+"""Files that are whole or not there: bytes, JSON, arrays; read with one line where damaged."""
 
 import contextlib
-import csv
 import errno
-import io
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -73,18 +71,6 @@ def load_arrays(path: Path) -> tuple[Arrays, dict[str, Any]]:
     with reading(path), safe_open(path, "numpy") as file:
         arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
         return arrays, json.loads((file.metadata() or {})["facts"])
-
-
-def csv_text(
-    columns: Sequence[str], rows: Iterable[Mapping[str, Any]], *, header: bool = True
-) -> str:
-    """Rows of a table."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    if header:
-        writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
 
 
 def write_json(path: Path, value: Any) -> None:

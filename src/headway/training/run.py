@@ -41,7 +41,6 @@ from headway.training.files import (
     Arrays,
     Tree,
     arrays_bytes,
-    csv_text,
     load_arrays,
     make_dir,
     reading,
@@ -349,8 +348,13 @@ class RunDir:
             files[_name("tests", iteration)] = arrays_bytes(arrays, {**facts, "groups": groups})
         lines = {"metrics.jsonl": json.dumps(metrics, allow_nan=False) + "\n"}
         for name, columns in TABLES.items():
-            lines[name] = csv_text(columns, tables.get(name, ()), header=iteration == 0)
-        files |= {name: self._table(name) + text.encode() for name, text in lines.items()}
+            text = io.StringIO()
+            writer = csv.DictWriter(text, columns, lineterminator="\n")
+            if iteration == 0:
+                writer.writeheader()
+            writer.writerows(tables.get(name, ()))
+            lines[name] = text.getvalue()
+        files |= {name: self._table(name) + new.encode() for name, new in lines.items()}
         known = self._checksums(iteration - 1)
         for name, content in files.items():
             write_bytes(self.path / name, content)
