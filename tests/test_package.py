@@ -2,7 +2,6 @@
 
 import inspect
 import re
-import shutil
 import subprocess
 import sys
 import tomllib
@@ -153,16 +152,3 @@ def test_links_lead_somewhere(page):
         assert file.exists(), f"{page.name} links to {target}, which is not there"
         if anchor:
             assert anchor in anchors(file), f"{page.name} links to {target}: no such heading"
-
-
-@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
-def test_make_clean_removes_caches_and_nothing_else(tmp_path):
-    for folder in ROOT.iterdir():
-        if folder.is_dir() and not folder.name.startswith("."):
-            (tmp_path / folder.name / "inside").mkdir(parents=True)
-    shutil.copy(ROOT / "Makefile", tmp_path)
-    left_over = {"build", "dist", "site"}
-    kept = sorted(path for path in tmp_path.rglob("*") if not left_over & set(path.parts))
-    (tmp_path / "src" / "inside" / "__pycache__").mkdir()
-    subprocess.run(["make", "clean"], cwd=tmp_path, check=True, capture_output=True)
-    assert sorted(tmp_path.rglob("*")) == kept

@@ -13,7 +13,7 @@ import pytest
 
 import headway
 from headway import task
-from headway.cli import main
+from headway.cli import COMMANDS, main
 from headway.config import MODELS, OwnModelConfig, known_settings
 from headway.errors import ConfigError
 from headway.training import methods, trainers
@@ -131,16 +131,6 @@ PAGES = [
     ROOT / "README.md",
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted((ROOT / "results").rglob("README.md")),
-]
-COMMANDS = [
-    "train",
-    "evaluate",
-    "record",
-    "report",
-    "diagnose",
-    "reproduce",
-    "sweep",
-    "plot-dynamics",
 ]
 
 

@@ -50,7 +50,12 @@ ONE_NETWORK = {
     "model.deterministic": True,
     "planner.num_particles": 1,
 }
-CADM = {"model.context_at": "input", "fitting.future_length": 10}
+CADM = {
+    "model.context_at": "input",
+    "fitting.future_length": 10,
+    "fitting.context_weight_decay": True,
+}
+AT_INPUT = {**ONE_STEP, "model.context_at": "input", "model.backward_net": False}
 PETS = {**NO_CONTEXT, **ONE_HEAD, **ONE_STEP}
 NO_HEADS = {"fitting.oracle": "independent", **ONE_STEP, "planner.num_particles": 1}
 ONLY_A_TEST = {"collection.num_iterations": 1}
@@ -92,39 +97,22 @@ _METHODS = (
     Method(
         "stacked",
         "vanilla with the flattened history appended to the input",
-        {
-            **ONE_NETWORK,
-            **ONE_STEP,
-            "model.context": "history",
-            "model.context_at": "input",
-            "model.backward_net": False,
-        },
+        {**ONE_NETWORK, **AT_INPUT, "model.context": "history"},
     ),
     Method(
         "cadm",
         "vanilla with a learned context at the input (Lee et al., 2020)",
-        {**ONE_NETWORK, **CADM, "fitting.context_weight_decay": True},
+        {**ONE_NETWORK, **CADM},
     ),
     Method(
         "pets-cadm",
         "PETS with CaDM's learned context at the input (Lee et al., 2020)",
-        {
-            **ONE_HEAD,
-            **CADM,
-            "fitting.context_weight_decay": True,
-            "model.backward_deterministic": True,
-        },
+        {**ONE_HEAD, **CADM, "model.backward_deterministic": True},
     ),
     Method(
         "oracle-params",
         "PETS that is told the true simulator parameters, an upper line; not a fair method",
-        {
-            **ONE_HEAD,
-            **ONE_STEP,
-            "model.context": "sim-params",
-            "model.context_at": "input",
-            "model.backward_net": False,
-        },
+        {**ONE_HEAD, **AT_INPUT, "model.context": "sim-params"},
     ),
     Method(
         "ria",
@@ -170,7 +158,6 @@ _METHODS = (
 )
 
 METHODS: dict[str, Method] = {method.name: method for method in _METHODS}
-
 
 SMALL_SEARCH = {
     "planner.num_candidates": 100,

@@ -7,6 +7,8 @@ poles. Its masses 0.15, 0.25 and 2.75, and all of its shorter episodes, are from
 with 16 episodes per unseen and 8 per training value.
 """
 
+import csv
+import importlib.resources
 from collections.abc import Mapping
 
 from headway.config import Config
@@ -14,49 +16,16 @@ from headway.errors import ConfigError
 from headway.task import env_options, env_spec, episode_length
 from headway.training.run import EpisodeRow
 
-_PENDULUM = {  # length: (random, ceiling), 200 steps
-    0.25: (-1748.0, -539.0),
-    0.375: (-1622.0, -239.0),
-    0.5: (-1501.0, -126.0),
-    0.75: (-1271.0, -107.0),
-    1.0: (-1143.0, -131.0),
-    1.25: (-1110.0, -170.0),
-    1.5: (-1041.0, -203.0),
-    1.75: (-1000.0, -240.0),
+with (importlib.resources.files(__package__) / "references.csv").open() as _file:
+    _ROWS = list(csv.DictReader(_file))
+_REFERENCES = {
+    (row["env"], int(row["steps"]), row["sim_param"], float(row["value"])): (
+        float(row["random"]),
+        float(row["ceiling"]),
+    )
+    for row in _ROWS
 }
-
-_CARTPOLE_SWINGUP = {  # mass scale: (random, ceiling), 500 steps
-    0.1: (215.0, 489.0),
-    0.15: (206.7, 486.7),
-    0.2: (183.0, 484.0),
-    0.25: (193.0, 482.7),
-    0.3: (146.0, 481.0),
-    0.5: (89.0, 462.0),
-    1.0: (33.0, 347.0),
-    1.5: (22.0, 233.0),
-    2.5: (16.0, 135.0),
-    2.75: (13.3, 110.4),
-    3.0: (14.0, 105.0),
-}
-
-_SHORT_CARTPOLE_SWINGUP = {  # mass scale: (random, ceiling), 200 steps
-    0.1: (83.8, 189.1),
-    0.15: (68.6, 186.7),
-    0.25: (47.5, 182.7),
-    0.5: (20.4, 155.3),
-    1.5: (1.6, 35.8),
-    2.5: (2.0, 15.7),
-    2.75: (1.9, 13.8),
-    3.0: (3.5, 14.3),
-}
-
-_TABLES = {  # by environment and steps of an episode: what varies, and the returns
-    ("pendulum", 200): ("length", _PENDULUM),
-    ("cartpole-swingup", 500): ("mass_scale", _CARTPOLE_SWINGUP),
-    ("cartpole-swingup", 200): ("mass_scale", _SHORT_CARTPOLE_SWINGUP),
-}
-
-_MEASURED = {env for env, _ in _TABLES}
+_MEASURED = {row["env"] for row in _ROWS}
 
 
 def score_of(row: EpisodeRow, config: Config) -> float | None:
@@ -88,14 +57,12 @@ def score(
     Returns:
         The score, or None where no reference is known for these physics and this length.
     """
-    if (env, length) not in _TABLES:
-        return None
-    name, table = _TABLES[env, length]
-    others_nominal = all(value == 1.0 for other, value in sim_params.items() if other != name)
-    if sim_params.get(name) not in table or not others_nominal:
-        return None
-    random, ceiling = table[sim_params[name]]
-    return normalised(episode_return, random, ceiling)
+    for name, value in sim_params.items():
+        found = _REFERENCES.get((env, length, name, value))
+        others_nominal = all(sim_params[other] == 1.0 for other in sim_params if other != name)
+        if found and others_nominal:
+            return normalised(episode_return, *found)
+    return None
 
 
 def normalised(episode_return: float, random: float, ceiling: float) -> float:
