@@ -151,8 +151,6 @@ class Train(Command):
         """Take the settings of environment, method and preset."""
         from headway.training.methods import make_config
 
-        if not names.words:
-            return self
         config = make_config(
             names.words[0], method=names.method, preset=names.preset, settings=names.settings()
         )
@@ -236,8 +234,6 @@ class _OfRun(Command):
 
     def with_defaults(self, names):
         """Take the settings of the run."""
-        if not names.words:
-            return self
         config = dataclasses.replace(self, run_dir=Path(names.words[0])).config()
         config = override(config, names.settings())
         taken = [name for name in ("planner", "evaluation") if hasattr(self, name)]
@@ -635,7 +631,7 @@ def parse(words: Sequence[str]) -> Command:
         return tyro.cli(commands, args=words, prog="headway", description=told, config=config)
     command, rest = COMMANDS[words[0]], words[1:]
     names, _ = tyro.cli(Names, args=rest, add_help=False, return_unknown_args=True)
-    default = command().with_defaults(names)
+    default = command().with_defaults(names) if names.words else command()
     return tyro.cli(command, default=default, args=rest, prog=f"headway {words[0]}", config=config)
 
 

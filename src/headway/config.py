@@ -379,7 +379,7 @@ class PlannerConfig:
         share = 2 if self.optimizer.name == "icem" else 1
         if share * elites > self.num_candidates:
             most = f"at most {'half of ' * (share == 2)}num_candidates ({self.num_candidates})"
-            raise _refused("optimizer.num_elites", elites, most)
+            raise _refused(self, "optimizer.num_elites", most)
         if self.selection_skips_newest and self.selection_length == 1:
             raise ValueError(
                 "selection_skips_newest leaves nothing of a selection_length of 1, allowed: 2 or"
@@ -458,29 +458,28 @@ class Config:
     """Testing."""
 
     def __post_init__(self):
-        model, planner, precision = self.model, self.planner, self.fitting.precision
-        simulated, processes = model.kind == "simulator", self.collection.env_processes
+        model, planner = self.model, self.planner
+        simulated = model.kind == "simulator"
         if planner.num_particles % model.num_members:
             allowed = f"a multiple of model.num_members ({model.num_members})"
-            raise _refused("planner.num_particles", planner.num_particles, allowed)
+            raise _refused(self, "planner.num_particles", allowed)
         if planner.adaptation != "none" and model.kind in BUILT_IN_KINDS[1:]:
             allowed = f"none with a model of kind {model.kind}, which has no heads"
-            raise _refused("planner.adaptation", planner.adaptation, allowed)
-        if precision != "float32" and model.relation_head:
+            raise _refused(self, "planner.adaptation", allowed)
+        if self.fitting.precision != "float32" and model.relation_head:
             allowed = "float32 with a relation head, whose losses are most of a fit"
-            raise _refused("fitting.precision", precision, allowed)
+            raise _refused(self, "fitting.precision", allowed)
         if simulated and planner.num_particles > 1:
-            allowed = "1, because the simulator has no noise"
-            raise _refused("planner.num_particles", planner.num_particles, allowed)
+            raise _refused(self, "planner.num_particles", "1, because the simulator has no noise")
         if simulated and planner.reward != "task":
-            allowed = "task, which the simulator pays"
-            raise _refused("planner.reward", planner.reward, allowed)
-        if simulated and processes:
+            raise _refused(self, "planner.reward", "task, which the simulator pays")
+        if simulated and self.collection.env_processes:
             allowed = "False with plans on the simulator itself"
-            raise _refused("collection.env_processes", processes, allowed)
+            raise _refused(self, "collection.env_processes", allowed)
 
 
-def _refused(name: str, value: Any, allowed: str) -> ValueError:
+def _refused(section: Any, name: str, allowed: str) -> ValueError:
+    value = operator.attrgetter(name)(section)
     return ValueError(f"{name} is {shown(value)}, allowed: {allowed}.")
 
 

@@ -170,25 +170,16 @@ class Fitted(Trainer):
         capacity = max(collection.num_iterations * collection.num_episodes, len(trajectories))
         return Episodes.pad(trajectories, capacity, episode_length(self.config), self.names)
 
-    def fit_by(
-        self,
-        one_epoch: Callable[..., tuple[FitState, EpochStats]],
-        state: TrainState,
-        trajectories: list[Trajectory],
-        first: int,
-        data_key: PRNGKeyArray,
-        epoch_key: PRNGKeyArray,
-    ) -> Epochs:
-        """Renew the normalisers, collate what an epoch reads, and go through it again and again.
+    def epoch(self, iteration: int, key: PRNGKeyArray) -> tuple[Callable, Any, Any]:
+        """A pass over the data, and the keys of bootstrap samples and of shuffles.
 
-        Args:
-            one_epoch: Goes once through the data: `(state, setup, data, *, key)`.
-            state: The state to go on from.
-            trajectories: All data so far.
-            first: The first epoch.
-            data_key: Draws the bootstrap samples.
-            epoch_key: Shuffles every epoch.
+        The pass is a function `(state, setup, data, *, key)` to the next state and its averages.
         """
+        raise NotImplementedError
+
+    def fit(self, state: TrainState, trajectories, iteration, key, first=0) -> Epochs:
+        """Renew the normalisers, collate what an epoch reads, and go through it again and again."""
+        one_epoch, data_key, epoch_key = self.epoch(iteration, key)
         model, fitting, fit = self.config.model, self.config.fitting, state.fit
         episodes = self.pad(trajectories)
         statistics = Statistics.fit(self.task, trajectories, self.history_length, self.names)
@@ -202,8 +193,8 @@ class Fitted(Trainer):
             episodes, samples, statistics, fitting, num_members=model.num_members, key=data_key
         )
         for epoch in range(first, fitting.epochs):
-            key = jax.random.fold_in(epoch_key, epoch)
-            fit, stats = one_epoch(fit, self.setup, data, key=key)
+            shuffle = jax.random.fold_in(epoch_key, epoch)
+            fit, stats = one_epoch(fit, self.setup, data, key=shuffle)
             yield TrainState(fit, statistics), jax.device_get(stats)
 
 
@@ -216,16 +207,15 @@ class MultiHeadedTrainer(Fitted):
         net = MultiHeadDynamics.init(model, self.task, sim_param_names=self.names, key=key)
         return self.begin_with(net)
 
-    def fit(self, state, trajectories, iteration, key, first=0) -> Epochs:
-        """See `Trainer.fit`."""
+    def epoch(self, iteration, key):
+        """See `Fitted.epoch`."""
         fitting = self.config.fitting
         independent = (
             iteration < fitting.warmup_iterations
             or fitting.oracle == "independent"
             or self.config.model.num_heads == 1
         )
-        one_epoch = partial(fit_epoch, independent=independent)
-        return self.fit_by(one_epoch, state, trajectories, first, *jax.random.split(key))
+        return partial(fit_epoch, independent=independent), *jax.random.split(key)
 
     def model(self, state: TrainState, trajectories: Sequence[Trajectory] = ()) -> MultiHeadModel:
         """See `Trainer.model`."""
@@ -285,10 +275,9 @@ class GradientAdaptedTrainer(Fitted):
         """See `Trainer.init`."""
         return self.begin_with(ReluNet.init(self.config.model, self.task, key=key))
 
-    def fit(self, state, trajectories, iteration, key, first=0) -> Epochs:
-        """See `Trainer.fit`."""
-        one_epoch = partial(meta_epoch, **self.inner_step)
-        return self.fit_by(one_epoch, state, trajectories, first, key, key)
+    def epoch(self, iteration, key):
+        """See `Fitted.epoch`."""
+        return partial(meta_epoch, **self.inner_step), key, key
 
     def model(self, state: TrainState, trajectories: Sequence[Trajectory] = ()) -> GrBAL:
         """See `Trainer.model`."""
@@ -302,9 +291,9 @@ class RecurrentTrainer(Fitted):
         """See `Trainer.init`."""
         return self.begin_with(RecurrentNet.init(self.config.model, self.task, key=key))
 
-    def fit(self, state, trajectories, iteration, key, first=0) -> Epochs:
-        """See `Trainer.fit`."""
-        return self.fit_by(recurrent_epoch, state, trajectories, first, key, key)
+    def epoch(self, iteration, key):
+        """See `Fitted.epoch`."""
+        return recurrent_epoch, key, key
 
     def model(self, state: TrainState, trajectories: Sequence[Trajectory] = ()) -> ReBAL:
         """See `Trainer.model`."""
