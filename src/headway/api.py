@@ -29,16 +29,21 @@ class Run:
     evaluation: list[EpisodeRow]
     """Every test episode, as in `evaluation.csv`."""
 
+    @property
+    def last_tests(self) -> list[EpisodeRow]:
+        """The newest test episodes."""
+        last = max((row.iteration for row in self.evaluation), default=0)
+        return [row for row in self.evaluation if row.iteration == last]
+
     def controller(self, *, seed: int = 0, **options: Any) -> Controller:
         """The trained controller; options are those of `load`."""
         return load(self.path, seed=seed, **options)
 
     def __repr__(self) -> str:
         """One line: directory and last test returns."""
-        config, last = self.config, max((row.iteration for row in self.evaluation), default=0)
-        tests = [row for row in self.evaluation if row.iteration == last]
+        config = self.config
         name = f"{config.method} on {config.env}, seed {config.seed}"
-        name += f", {len(self.metrics)} iterations{returns_in_words(tests)}"
+        name += f", {len(self.metrics)} iterations{returns_in_words(self.last_tests)}"
         return f"Run({str(self.path)!r}: {name})"
 
 

@@ -36,9 +36,6 @@ MAX_SEEDS = 1000
 PIPE_WIDTH = 130
 RESUMABLE = ("train", "reproduce", "sweep")
 TERMINATED = 143  # as a shell reports SIGTERM
-PAPER_ENVS = (
-    "cartpole-swingup", "pendulum", "hopper", "slim-humanoid", "half-cheetah", "crippled-ant",
-)  # fmt: skip
 
 SECTIONS = ("model", "fitting", "planner", "collection", "evaluation")
 
@@ -196,8 +193,7 @@ class Train(Command):
             progress=self.progress(),
             resume_from_last_good=self.resume_from_last_good,
         )
-        last = max((row.iteration for row in run.evaluation), default=0)
-        rows = [row for row in run.evaluation if row.iteration == last]
+        rows = run.last_tests
         drawn = [str(path) for path in figures.save_run_figures(run.path)]
         facts = {
             "run_dir": str(run.path),
@@ -388,7 +384,7 @@ class Report(Command):
 class _Runs(Command):
     """Options of the commands that make many runs."""
 
-    envs: Annotated[tuple[str, ...], _unless_given("the paper's six")] = PAPER_ENVS
+    envs: Annotated[tuple[str, ...], _unless_given("the paper's six")] = ()
     """Environments; `headway list envs` shows them."""
     seeds: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SEED|FROM:TO")] = ("0:3",)
     """Seeds, or ranges without their end: 0:3 is 0 1 2."""
@@ -412,10 +408,11 @@ class _Runs(Command):
 
     def compare(self, experiment: Any, settings: Mapping[str, Any], words: Sequence[str]) -> int:
         """Make the runs that are missing, and print what all of them found."""
+        from headway.lab.paper import PAPER_ENVS
         from headway.lab.sweep import Comparison, Workers
 
-        seeds = read_seeds(self.seeds)
-        comparison = Comparison(experiment, self.envs, seeds, self.preset, self.out, settings)
+        envs, seeds = self.envs or PAPER_ENVS, read_seeds(self.seeds)
+        comparison = Comparison(experiment, envs, seeds, self.preset, self.out, settings)
         if self.dry_run:
             from headway.lab.comparison import states
 

@@ -232,32 +232,21 @@ def test_a_second_signal_stops_at_once_and_an_error_is_not_hidden(progress, erro
         train.train_run(runs.tiny_config(), tmp_path / "run", progress())
 
 
-@pytest.fixture(scope="module")
-def environment(tmp_path_factory):
-    """Compiled code is kept between the processes."""
-    return {
-        **os.environ,
-        "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("compiled")),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
-    }
-
-
 def command(path, iterations):
     words = [sys.executable, "-m", "headway", "train", "pendulum", "--preset", "smoke", "--quiet"]
     return [*words, "--collection.num-iterations", str(iterations), "--run-dir", str(path)]
 
 
 @pytest.mark.slow
-def test_true_sigkills_change_nothing(environment, tmp_path):
-    subprocess.run(command(tmp_path / "whole", 4), env=environment, check=True)
+def test_true_sigkills_change_nothing(tmp_path):
+    subprocess.run(command(tmp_path / "whole", 4), check=True)
     rng = np.random.default_rng(0)
     kills = 0
     while kills < 10:
         path = tmp_path / f"run-{kills}"
         for _ in range(4):
             before = set(path.rglob("*"))
-            process = subprocess.Popen(command(path, 4), env=environment)
+            process = subprocess.Popen(command(path, 4))
             while process.poll() is None and set(path.rglob("*")) <= before:
                 time.sleep(0.01)  # until it has done something
             try:
@@ -267,17 +256,15 @@ def test_true_sigkills_change_nothing(environment, tmp_path):
                 process.kill()
                 process.wait()
                 kills += 1
-        subprocess.run(command(path, 4), env=environment, check=True)
+        subprocess.run(command(path, 4), check=True)
         assert runs.result(path) == runs.result(tmp_path / "whole"), kills
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_the_command_exits_with_the_code_of_the_signal(number, code, environment, tmp_path):
+def test_the_command_exits_with_the_code_of_the_signal(number, code, tmp_path):
     path = tmp_path / "run"
-    process = subprocess.Popen(
-        command(path, 500), env=environment, stderr=subprocess.PIPE, text=True
-    )
+    process = subprocess.Popen(command(path, 500), stderr=subprocess.PIPE, text=True)
     while process.poll() is None and not (path / "checksums").exists():
         time.sleep(0.1)
     process.send_signal(number)

@@ -1,4 +1,4 @@
-"""Loading the controller of a run: another planner, a copy that lacks files, no simulator."""
+"""Acting from a run: another planner, heads that learn, a copy that lacks files, no simulator."""
 
 import dataclasses
 import shutil
@@ -12,9 +12,12 @@ import pytest
 import headway
 from headway.config import CEMConfig
 from headway.errors import ConfigError, RunError
+from headway.training.methods import config_to_evaluate
 from headway.training.run import RunDir
+from headway.training.trainers import load_agent, make_trainer
 
 OBS = np.array([1.0, 0.0, 0.0])
+LAST_LAYER = {"planner.adaptation": "last-layer"}
 
 
 def test_a_controller_can_have_another_planner(root):
@@ -27,7 +30,7 @@ def test_a_controller_can_have_another_planner(root):
 
 
 def test_a_controller_can_go_on_learning(root):
-    controller = headway.load(root, settings={"planner.adaptation": "last-layer"})
+    controller = headway.load(root, settings=LAST_LAYER)
     for _ in range(2):
         controller.act(OBS)
     assert controller.agent.model.prior is not None
@@ -35,20 +38,36 @@ def test_a_controller_can_go_on_learning(root):
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("name", "message"),
     [
-        ({"model.num_heads": 3}, "model.num_heads cannot change here"),
-        (
-            {"evaluation.num_episodes": 3},
-            "evaluation.num_episodes cannot change here",
-        ),
-        ({"planner.num_candidate": 3}, "unknown setting .* Did you mean 'planner.num_candidates'"),
-        ({"planner.num_candidates": 0}, "planner.num_candidates is 0, allowed: greater"),
+        ("model.num_heads", "model.num_heads cannot change here"),
+        ("evaluation.num_episodes", "evaluation.num_episodes cannot change here"),
+        ("planner.num_candidate", "unknown setting .* Did you mean 'planner.num_candidates'"),
     ],
 )
-def test_what_a_controller_cannot_use_is_refused(settings, message, root):
+def test_what_a_controller_cannot_use_is_refused(name, message, root):
     with pytest.raises(ConfigError, match=message):
-        headway.load(root, settings=settings)
+        headway.load(root, settings={name: 3})
+
+
+def test_a_run_of_frozen_heads_is_tested_with_heads_that_learn(two_iterations):
+    frozen, learning = (
+        headway.evaluate(two_iterations, groups=["train"], num_episodes=2, settings=settings)
+        for settings in ({}, LAST_LAYER)
+    )
+    returns = [[row.episode_return for row in rows] for rows in (frozen, learning)]
+    assert np.isfinite(returns).all()
+    assert returns[0] != returns[1]
+
+
+def test_the_prior_of_a_loaded_agent_comes_from_all_its_data(two_iterations):
+    run = RunDir(two_iterations)
+    config = config_to_evaluate(run.config(), LAST_LAYER)
+    agent, trainer = load_agent(run, config), make_trainer(config)
+    assert agent.model.prior.root.shape[0] == agent.model.net.num_members
+    part = trainer.agent(trainer.load(run), run.load_data()[:1])
+    assert (part.model.prior.noise != agent.model.prior.noise).all()
+    assert load_agent(run).model.prior is None
 
 
 SERVED = ("config.json", "checksums/iteration-001.json", "checkpoints/iteration-001.safetensors")
@@ -78,7 +97,7 @@ def test_a_file_that_a_copy_lacks_is_named(missing, root):
 
 def test_learning_on_needs_the_data_as_well(root):
     with pytest.raises(RunError, match="data/iteration-000"):
-        headway.load(copy_of(root, SERVED), settings={"planner.adaptation": "last-layer"})
+        headway.load(copy_of(root, SERVED), settings=LAST_LAYER)
 
 
 def test_a_controller_is_loaded_without_a_simulator(root):

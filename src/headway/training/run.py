@@ -56,14 +56,13 @@ SCHEMA = 3  # of a run directory
 KEPT = 2  # iterations whose checkpoints and tests stay, so that there is one to go back to
 LOCK = ".lock"
 VERSIONED = ("headway", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco")
-EVALUATION_COLUMNS = (
-    "method", "env", "seed", "iteration", "group", "sim_params", "episode", "return", "length",
-)  # fmt: skip
 TABLES = {
-    "evaluation.csv": EVALUATION_COLUMNS,
+    "evaluation.csv": (
+        "method", "env", "seed", "iteration", "group", "sim_params", "episode", "return", "length",
+    ),
     "assignments.csv": ("iteration", "member", "head", "sim_params", "share"),
     "prediction_error.csv": ("iteration", "group", "step", "error"),
-}
+}  # fmt: skip
 _TYPES = {
     **dict.fromkeys(("seed", "iteration", "episode", "length", "member", "head", "step"), int),
     **dict.fromkeys(("return", "share", "error"), float),
@@ -96,7 +95,7 @@ class EpisodeRow:
 
     def to_csv(self) -> dict[str, Any]:
         """The row as it is written."""
-        cells = dict(zip(EVALUATION_COLUMNS, vars(self).values(), strict=True))
+        cells = dict(zip(TABLES["evaluation.csv"], vars(self).values(), strict=True))
         return cells | {"sim_params": format_sim_params(self.sim_params)}
 
 
