@@ -1,13 +1,12 @@
 """Tiny runs: trained, compared, or written by hand."""
 
-import hashlib
 import json
 
 from headway.config import to_dict
 from headway.training.files import write_json
 from headway.training.methods import make_config
 from headway.training.progress import Progress
-from headway.training.run import SCHEMA, TABLES, RunDir
+from headway.training.run import SCHEMA, RunDir
 
 TINY = {
     "collection.episode_length": 12,
@@ -67,18 +66,3 @@ def write_run(path, config, metrics, tables):
         }
         RunDir(path).save_iteration(line, (), [], {}, own)
     return path
-
-
-def accept_changes(path):
-    """Make a run's checksums fit tables that a test has changed, as far as they are there."""
-    lines = (path / "metrics.jsonl").read_text().splitlines()
-    for file in (path / "checksums").iterdir():
-        file.unlink()
-    found = {}
-    for name in ("config.json", "metrics.jsonl", *TABLES):
-        if (path / name).exists():
-            content = (path / name).read_bytes()
-            digest = hashlib.sha256(content).hexdigest()
-            found[name] = {"bytes": len(content), "sha256": digest}
-    if lines:
-        write_json(path / f"checksums/iteration-{len(lines) - 1:03d}.json", found)
