@@ -36,23 +36,22 @@ def prediction_error(
     longest = max(len(t) for t in trajectories)
     slots = longest if model.memory is None else max(model.memory, 1)
 
-    def past(shift: int, name: str):
-        rows = [getattr(t, name)[max(s - slots, 0) + shift : s + shift] for t, s in starts]
-        missing = [((slots - len(row), 0), (0, 0)) for row in rows]
-        return jnp.asarray(np.stack([np.pad(*pair) for pair in zip(rows, missing, strict=True)]))
-
-    def future(shift: int, name: str):
-        return np.stack([getattr(t, name)[s + shift : s + horizon + shift] for t, s in starts])
+    def window(name: str, begin: int, length: int):
+        """Rows from `begin` after each moment on; zeros before the episode."""
+        padded = (np.pad(getattr(t, name), ((slots, 0), (0, 0)))[s:] for t, s in starts)
+        return np.stack([rows[slots + begin :][:length] for rows in padded])
 
     count = jnp.asarray([min(s, slots) for _, s in starts], jnp.int32)
-    recent = RecentTransitions(past(0, "obs"), past(0, "action"), past(1, "obs"), count)
+    obs, action = window("obs", -slots, slots), window("action", -slots, slots)
+    past = obs, action, window("obs", 1 - slots, slots)
+    recent = RecentTransitions(*map(jnp.asarray, past), count)
     told, names = None, model.sim_param_names
     if names:
         told = jnp.asarray(np.stack([sim_params_row(t.sim_params, names) for t, _ in starts]))
-    actions = jnp.asarray(future(0, "action"))
+    actions = jnp.asarray(window("action", 0, horizon))
     imagined = imagine(model, recent, actions, jax.random.split(key), told)
     std = np.concatenate([t.obs for t in trajectories]).std(0)
-    scaled = (np.asarray(imagined) - future(1, "obs")) / np.where(std > 1e-6, std, np.inf)
+    scaled = (np.asarray(imagined) - window("obs", 1, horizon)) / np.where(std > 1e-6, std, np.inf)
     return np.sqrt(np.square(scaled).mean((0, 1, 3)))
 
 
