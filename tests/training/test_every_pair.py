@@ -12,7 +12,12 @@ import headway
 from headway.task import env_names
 from headway.training.methods import METHODS
 
-TINY = {"collection.episode_length": 16, "fitting.epochs": 1, "evaluation.num_episodes": 1}
+TINY = {
+    "collection.num_episodes": 1,  # one plan serves the run and the controller
+    "collection.episode_length": 16,
+    "fitting.epochs": 1,
+    "evaluation.num_episodes": 1,
+}
 DEFAULT = {
     ("tmcl", "cartpole-swingup"),
     ("tmcl-bayes", "half-cheetah"),
