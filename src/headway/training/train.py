@@ -1,5 +1,6 @@
 """The training loop: collect, fit, evaluate, save, and again (supplement A.2)."""
 
+import dataclasses
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import closing
@@ -26,7 +27,7 @@ from headway.training.collect import (
 from headway.training.evaluate import Tests, run_tests
 from headway.training.files import tree_arrays, tree_from_arrays
 from headway.training.progress import Progress
-from headway.training.run import Partial, RunDir
+from headway.training.run import RunDir
 from headway.training.stopping import StopRequest, stop_requests
 from headway.training.trainers import make_trainer
 
@@ -85,37 +86,28 @@ def train_run(
     return run
 
 
+@dataclasses.dataclass
 class _Training:
-    """A run in progress.
+    """A run in progress."""
 
-    Args:
-        config: All settings.
-        run: The directory, which is locked.
-        environments: Where it acts.
-        progress: What is told.
-        stop: Asks to stop.
-    """
+    config: Config
+    run: RunDir
+    """The directory, which is locked."""
+    environments: Environments
+    progress: Progress
+    stop: StopRequest
 
-    def __init__(
-        self,
-        config: Config,
-        run: RunDir,
-        environments: Environments,
-        progress: Progress,
-        stop: StopRequest,
-    ):
-        self.config, self.run, self.environments = config, run, environments
-        self.progress, self.stop = progress, stop
-        self.trainer = make_trainer(config, environments)
-        self.data = run.load_data() if config.model.learns else []
-        self.state = self.trainer.load(run) if run.finished_iterations else self.trainer.begin()
+    def __post_init__(self):
+        learns, begun = self.config.model.learns, self.run.finished_iterations > 0
+        self.trainer = make_trainer(self.config, self.environments)
+        self.data = self.run.load_data() if learns else []
+        self.state = self.trainer.load(self.run) if begun else self.trainer.begin()
 
     def train(self) -> None:
         """Go through the iterations that are left; only the last write makes one count."""
         config, run, trainer = self.config, self.run, self.trainer
-        todo = range(run.finished_iterations, config.collection.num_iterations)
-        for iteration in todo:
-            partial = run.partial()
+        for iteration in range(run.finished_iterations, config.collection.num_iterations):
+            self.iteration, self.partial = iteration, run.partial()
             # From seed and iteration alone, however often the run was interrupted before.
             key = jax.random.fold_in(jax.random.key(config.seed), iteration + 1)
             collect_key, fit_key, test_key, error_key = jax.random.split(key, 4)
@@ -123,13 +115,13 @@ class _Training:
             collected: list[Trajectory] = []
             seconds = {}
             if config.model.learns:
-                rollout = self.collect(iteration, collect_key, partial)
+                rollout = self.collect(collect_key)
                 collected, seconds["collect"] = list(rollout.episodes.values()), rollout.seconds
                 self.data += collected
                 failures = {"planner_failures": rollout.use.failures}
                 metrics["collection"] = _summary(collected) | failures
-                metrics["fitting"], seconds["fit"] = self.fit(iteration, fit_key, partial)
-            tests = self.evaluate(iteration, test_key, partial)
+                metrics["fitting"], seconds["fit"] = self.fit(fit_key)
+            tests = self.evaluate(test_key)
             seconds["evaluate"] = tests.seconds
             tested = tests.trajectories
             metrics |= {
@@ -153,24 +145,24 @@ class _Training:
                 ],
             }
             run.save_iteration(metrics, self.state, collected, tested, tables)
-            partial.remove()
+            self.partial.remove()
             self.progress.iteration_done(metrics)
             self.stop.answer()
         run.partial().remove()
 
-    def groups(self, iteration: int) -> list[str]:
-        """The groups that are tested after an iteration; often none."""
-        evaluation = self.config.evaluation
-        last = iteration == self.config.collection.num_iterations - 1
-        if not last and (iteration + 1) % evaluation.every:
+    def groups(self) -> list[str]:
+        """The groups that are tested after this iteration; often none."""
+        evaluation, number = self.config.evaluation, self.iteration + 1
+        last = number == self.config.collection.num_iterations
+        if not last and number % evaluation.every:
             return []
         train, *unseen = self.environments.sim_params.group_names
         with_train = last or evaluation.training_group == "always"
         return [train, *unseen] if with_train else unseen
 
-    def begin_phase(self, iteration: int, name: str, work: int) -> None:
+    def begin_phase(self, name: str, work: int) -> None:
         """Announce what comes next, and its environment steps or epochs."""
-        place = f"[{iteration + 1}/{self.config.collection.num_iterations}]"
+        place = f"[{self.iteration + 1}/{self.config.collection.num_iterations}]"
         self.progress.phase(f"{place} {name}", work)
 
     def on_step(self, steps: int) -> None:
@@ -178,34 +170,32 @@ class _Training:
         self.progress.advance(steps)
         self.stop.answer()
 
-    def collect(self, iteration: int, key: PRNGKeyArray, partial: Partial) -> Rollout:
+    def collect(self, key: PRNGKeyArray) -> Rollout:
         """Run one episode in each environment, under physics drawn from the training set."""
         environments, count = self.environments, self.config.collection.num_episodes
-        self.begin_phase(iteration, "collect", count * environments.episode_length)
-        rng = np.random.default_rng([self.config.seed, iteration])
+        self.begin_phase("collect", count * environments.episode_length)
+        rng = np.random.default_rng([self.config.seed, self.iteration])
         seeds = rng.integers(2**31 - 1, size=count)
         episodes = [Episode(environments.sim_params.sample(rng), int(seed)) for seed in seeds]
 
         def policy() -> Policy:
-            if iteration == 0:
+            if self.iteration == 0:
                 return random_policy(environments, rng)
             agent = self.trainer.agent(self.state, self.data)
             return agent_policy(agent, count, episodes, key=key)
 
-        batches = self.batches("collection", partial)
+        batches = self.batches("collection")
         rollout = batches.run("collect", episodes, policy)
         if not rollout.episodes:
             raise batches.too_many()
         return rollout
 
-    def batches(self, phase: Literal["collection", "evaluation"], partial: Partial) -> Batches:
+    def batches(self, phase: Literal["collection", "evaluation"]) -> Batches:
         """Run the episodes of a phase."""
         say = self.progress.message
-        return Batches(self.environments, self.config, phase, self.on_step, say, partial)
+        return Batches(self.environments, self.config, phase, self.on_step, say, self.partial)
 
-    def fit(
-        self, iteration: int, key: PRNGKeyArray, partial: Partial
-    ) -> tuple[dict[str, Any], float]:
+    def fit(self, key: PRNGKeyArray) -> tuple[dict[str, Any], float]:
         """Renew the statistics and go through the data `epochs` times.
 
         An epoch that diverges is made again from where the last good one ended, with a smaller
@@ -217,8 +207,8 @@ class _Training:
         Raises:
             DivergenceError: It diverged again and again.
         """
-        self.begin_phase(iteration, "fit", self.config.fitting.epochs)
-        rollbacks, seconds = 0, 0.0
+        self.begin_phase("fit", self.config.fitting.epochs)
+        iteration, partial, rollbacks, seconds = self.iteration, self.partial, 0, 0.0
         history: list[EpochStats] = []
         kept = partial.load("fit")
         if kept is not None:
@@ -274,15 +264,15 @@ class _Training:
         }
         return measured, seconds + time.perf_counter() - started
 
-    def evaluate(self, iteration: int, key: PRNGKeyArray, partial: Partial) -> Tests:
+    def evaluate(self, key: PRNGKeyArray) -> Tests:
         """Test on the unseen groups, and on the training physics when the settings say so."""
-        groups = self.groups(iteration)
+        groups = self.groups()
         if not groups:
             return Tests()
         num_tests = len(groups) * self.config.evaluation.num_episodes
-        self.begin_phase(iteration, "evaluate", num_tests * self.environments.episode_length)
+        self.begin_phase("evaluate", num_tests * self.environments.episode_length)
         agent = self.trainer.agent(self.state, self.data)
-        return run_tests(agent, groups, self.batches("evaluation", partial), key)
+        return run_tests(agent, groups, self.batches("evaluation"), key)
 
 
 def divergence(stats: EpochStats, before: Sequence[EpochStats]) -> str | None:

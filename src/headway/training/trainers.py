@@ -251,9 +251,8 @@ class MultiHeadedTrainer(Fitted):
         counts = defaultdict(lambda: np.zeros((net.num_members, net.num_heads)))
         for row, trajectory in enumerate(trajectories):
             used = -(-len(trajectory) // setup.segment_length)
-            for head in range(net.num_heads):
-                of_head = (best[:, row, :used] == head).sum(-1)
-                counts[format_sim_params(trajectory.sim_params)][:, head] += of_head
+            of_heads = best[:, row, :used, None] == np.arange(net.num_heads)
+            counts[format_sim_params(trajectory.sim_params)] += of_heads.sum(1)
         return [
             {"member": member, "head": head, "sim_params": physics, "share": float(share)}
             for physics, count in sorted(counts.items())
