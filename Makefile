@@ -23,7 +23,7 @@ demo: $(VENV)/main.stamp ## Train and evaluate T-MCL on Pendulum, in minutes
 	@$(BIN)/headway train pendulum --preset quick --seed 0 --run-dir runs/demo
 
 test: $(VENV)/test.stamp ## Run the tests; JOBS=4 runs four at a time
-	@$(BIN)/python -m pytest -n $(JOBS) -m "not slow"
+	@$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder -m "not slow"
 
 test-slow: $(VENV)/test.stamp $(VENV)/docs.stamp ## Run the tests that take minutes each
 	@$(BIN)/python -m pytest -m slow
