@@ -8,7 +8,13 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 import jaxtyping
 
 jaxtyping.install_import_hook(
-    ["headway.models", "headway.planning", "headway.data", "headway.task", "headway.envs.classic"],
+    [
+        "headway.models",
+        "headway.planning",
+        "headway.data",
+        "headway.task",
+        "headway.worlds.classic",
+    ],
     "beartype.beartype",
 )
 

@@ -35,12 +35,20 @@ def run_python(code: str) -> str:
 
 
 @pytest.mark.parametrize(
-    "module", ["headway", "headway.models.fitting", "headway.planning.agent", "headway.api"]
+    "module",
+    ["headway", "headway.api", "headway.models.fitting", "headway.planning.agent"]
+    + ["headway.worlds.locomotion"],
 )
 def test_import_is_light(module):
     loaded = set(run_python(f"import {module}, sys; print(*sys.modules)").split())
     assert module in loaded
     assert not HEAVY & loaded
+
+
+def test_gymnasium_knows_the_environments_once_they_are_imported():
+    make = "gymnasium.make('headway/Pendulum-v0').reset()"
+    loaded = run_python(f"import gymnasium, headway.envs as e, sys; print(*sys.modules); {make}")
+    assert not {"jax", "mujoco"} & set(loaded.split())
 
 
 def test_version_is_the_one_in_pyproject_and_is_cited():

@@ -24,40 +24,37 @@ class SimParamSets:
     Values of different parameters are independent: a set stands for all their combinations.
 
     Example:
-        >>> sets = SimParamSets({"length": (0.5, 1.0)}, {"long": {"length": (1.5,)}})
+        >>> sets = SimParamSets({"length": [0.5, 1.0]}, {"long": {"length": np.linspace(2, 3, 2)}})
         >>> sets.group_names
         ('train', 'long')
-        >>> sets.group("train")
-        [{'length': 0.5}, {'length': 1.0}]
+        >>> sets.group("long")
+        [{'length': 2.0}, {'length': 3.0}]
 
     Raises:
         ConfigError: A part is missing, unknown, of the wrong type, or no finite number.
     """
 
     train: Values
-    """Values of each parameter during training."""
+    """Values of each parameter during training: a tuple, a list or an array."""
     unseen: Mapping[str, Values] = dataclasses.field(default_factory=dict)
     """Values of each parameter in each group of test physics, by the group's name."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.unseen, Mapping):
+        if not isinstance(self.unseen, Mapping) or "train" in self.unseen:
             raise ConfigError(
-                f"sim_params unseen is {shown(self.unseen)}, allowed: parameter values by"
-                " group name."
+                f"sim_params unseen is {shown(self.unseen)}, allowed: parameter values by the"
+                " names of groups other than 'train'."
             )
-        _check_values("train", self.train)
+        object.__setattr__(self, "train", _checked("train", self.train))
+        unseen = {}
         for name, values in self.unseen.items():
-            if name == "train" or not isinstance(name, str):
-                raise ConfigError(
-                    f"sim_params unseen has a group {shown(name)}, allowed: names other than"
-                    " 'train'."
-                )
-            _check_values(f"unseen group {shown(name)}", values)
+            unseen[str(name)] = _checked(f"unseen group {shown(name)}", values)
             if set(values) != set(self.train):
                 raise ConfigError(
                     f"sim_params unseen group {name!r} has {', '.join(map(str, values))}, allowed:"
                     f" a value for every parameter of train, {', '.join(self.train)}."
                 )
+        object.__setattr__(self, "unseen", unseen)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -71,9 +68,7 @@ class SimParamSets:
 
     def sample(self, rng: np.random.Generator) -> dict[str, float]:
         """Draw each parameter uniformly and independently from its training values."""
-        return {
-            name: float(values[rng.integers(len(values))]) for name, values in self.train.items()
-        }
+        return {name: values[rng.integers(len(values))] for name, values in self.train.items()}
 
     def group(self, name: str) -> list[dict[str, float]]:
         """Return every combination of a group's values.
@@ -82,8 +77,7 @@ class SimParamSets:
             UnknownNameError: There is no such group.
         """
         values = self._values(name)
-        combinations = itertools.product(*values.values())
-        return [dict(zip(values, map(float, chosen), strict=True)) for chosen in combinations]
+        return [dict(zip(values, row, strict=True)) for row in itertools.product(*values.values())]
 
     def spread(self, name: str, count: int) -> list[dict[str, float]]:
         """Return so many physics of a group, with every value of a parameter equally often.
@@ -100,8 +94,8 @@ class SimParamSets:
             return [combinations[i % len(combinations)] for i in range(count)]
         rng = np.random.default_rng(0)
         columns = {
-            parameter: np.array(numbers)[rng.permutation(np.arange(count) * len(numbers) // count)]
-            for parameter, numbers in self._values(name).items()
+            key: np.array(column)[rng.permutation(np.arange(count) * len(column) // count)]
+            for key, column in self._values(name).items()
         }
         return [{key: float(column[i]) for key, column in columns.items()} for i in range(count)]
 
@@ -112,13 +106,11 @@ class SimParamSets:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain dictionaries and lists, ready for JSON."""
-        lists = {
-            group: {
-                key: [float(x) for x in numbers] for key, numbers in self._values(group).items()
-            }
-            for group in self.group_names
-        }
-        return {"train": lists.pop("train"), "unseen": lists}
+        train, *unseen = (
+            {key: list(column) for key, column in self._values(name).items()}
+            for name in self.group_names
+        )
+        return {"train": train, "unseen": dict(zip(self.unseen, unseen, strict=True))}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "SimParamSets":
@@ -132,42 +124,35 @@ class SimParamSets:
                 f"sim_params is {shown(values)}, allowed: {{'train': {{name: [values]}}, 'unseen':"
                 " {group: {name: [values]}}}."
             )
-        unseen = values.get("unseen", {})
-        if isinstance(unseen, Mapping):
-            unseen = {name: _to_tuples(group) for name, group in unseen.items()}
-        return cls(_to_tuples(values["train"]), unseen)
+        return cls(**values)
 
 
-def _check_values(where: str, values: Any) -> None:
-    """Refuse anything but non-empty tuples of finite numbers by name."""
+def _checked(where: str, values: Any) -> dict[str, tuple[float, ...]]:
+    """Return a group's values as tuples; refuse anything but some finite numbers by name."""
     if not isinstance(values, Mapping) or not values:
         raise ConfigError(
             f"sim_params {where} is {shown(values)}, allowed: one or more values for each"
             " parameter."
         )
-    for name, numbers in values.items():
-        if not isinstance(numbers, tuple) or not numbers or not all(map(_is_finite, numbers)):
+    checked = {}
+    for name, given in values.items():
+        column = given.tolist() if isinstance(given, np.ndarray) else given
+        if not isinstance(column, list | tuple) or not column or not all(map(_is_finite, column)):
             raise ConfigError(
-                f"sim_params {where}, {str(name)[:80]}, is {shown(numbers)}, allowed: one or more"
+                f"sim_params {where}, {str(name)[:80]}, is {shown(column)}, allowed: one or more"
                 " finite numbers."
             )
-    if math.prod(map(len, values.values())) > MAX_COMBINATIONS:
+        checked[name] = tuple(map(float, column))
+    if math.prod(map(len, checked.values())) > MAX_COMBINATIONS:
         raise ConfigError(
             f"sim_params {where} has too many combinations of values, allowed: at most"
             f" {MAX_COMBINATIONS:,}."
         )
+    return checked
 
 
 def _is_finite(value: Any) -> bool:
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    return bool(number and abs(value) <= sys.float_info.max)
-
-
-def _to_tuples(values: Any) -> Any:
-    """Turn JSON's lists into tuples; what is no mapping of lists stays for the checks."""
-    if not isinstance(values, Mapping):
-        return values
-    return {
-        name: tuple(numbers) if isinstance(numbers, list | tuple) else numbers
-        for name, numbers in values.items()
-    }
+    if isinstance(value, np.generic):
+        value = value.item()
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number and abs(value) <= sys.float_info.max

@@ -24,6 +24,7 @@ Obs = Float[Array, "*batch obs"]
 Action = Float[Array, "*batch action"]
 Reward = Float[Array, "*batch"]
 Ends = Bool[Array, "*batch"]
+HostAction = Float[np.ndarray, "*batch action"]
 
 
 class Task(eqx.Module):
@@ -100,18 +101,14 @@ class Task(eqx.Module):
         return eqx.filter_eval_shape(self.preprocess, np.zeros(self.obs_size, np.float32)).shape[-1]
 
 
-def env_action(
-    task: Task, action: Float[np.ndarray, "*batch action"]
-) -> Float[np.ndarray, "*batch action"]:
+def env_action(task: Task, action: HostAction) -> HostAction:
     """`Task.scale_action` in NumPy, exactly within the environment's bounds."""
     low, high = np.asarray(task.action_low), np.asarray(task.action_high)
     scaled = low + 0.5 * (action.astype(np.float64) + 1.0) * (high - low)
     return np.clip(scaled, low, high).astype(np.float32)
 
 
-def scaled_action(
-    task: Task, action: Float[np.ndarray, "*batch action"]
-) -> Float[np.ndarray, "*batch action"]:
+def scaled_action(task: Task, action: HostAction) -> HostAction:
     """`Task.unscale_action` in NumPy."""
     low, high = np.asarray(task.action_low), np.asarray(task.action_high)
     return (2.0 * (action.astype(np.float64) - low) / (high - low) - 1.0).astype(np.float32)
@@ -150,26 +147,23 @@ class EnvSpec:
     """Entries of an observation with their units, for figures; unnamed ones are numbered."""
 
     def __post_init__(self) -> None:
-        if not self.name or self.episode_length < 1 or self.epochs < 1:
+        known = set(self.default_sim_params) == set(self.sim_params.names)
+        if not (self.name and self.episode_length >= 1 and self.epochs >= 1 and known):
             raise ConfigError(
-                f"environment {self.name!r} has episode_length {self.episode_length} and epochs"
-                f" {self.epochs}, allowed: a name, and at least 1 each."
-            )
-        if set(self.default_sim_params) != set(self.sim_params.names):
-            raise ConfigError(
-                f"environment {self.name!r} has default_sim_params for"
-                f" {sorted(self.default_sim_params)}, allowed: exactly those of its sim_params,"
+                f"environment {self.name!r} has episode_length {self.episode_length}, epochs"
+                f" {self.epochs} and default_sim_params for {sorted(self.default_sim_params)},"
+                f" allowed: a name, at least 1 each, and its sim_params,"
                 f" {sorted(self.sim_params.names)}."
             )
 
 
 _HOMES = {
-    "pendulum": "headway.envs.classic:PENDULUM",
-    "cartpole-swingup": "headway.envs.classic:CARTPOLE_SWINGUP",
-    "hopper": "headway.envs.locomotion:HOPPER",
-    "slim-humanoid": "headway.envs.locomotion:SLIM_HUMANOID",
-    "half-cheetah": "headway.envs.locomotion:HALF_CHEETAH",
-    "crippled-ant": "headway.envs.locomotion:CRIPPLED_ANT",
+    "pendulum": "headway.worlds.classic:PENDULUM",
+    "cartpole-swingup": "headway.worlds.classic:CARTPOLE_SWINGUP",
+    "hopper": "headway.worlds.locomotion:HOPPER",
+    "slim-humanoid": "headway.worlds.locomotion:SLIM_HUMANOID",
+    "half-cheetah": "headway.worlds.locomotion:HALF_CHEETAH",
+    "crippled-ant": "headway.worlds.locomotion:CRIPPLED_ANT",
 }
 BUILT_IN: tuple[str, ...] = tuple(_HOMES)
 """Names of the paper's six environments."""
@@ -212,17 +206,14 @@ def env_spec(name: str) -> EnvSpec:
         return _imported(_HOMES[name])
     if name in _registered:
         return _registered[name]
-    specs = [env_spec(known) for known in env_names()]
-    for spec in specs:
-        if name == spec.env_id:
-            return spec
+    by_id = {spec.env_id: spec for spec in map(env_spec, reversed(env_names()))}
+    if name in by_id:
+        return by_id[name]
     if ":" in name:
         if str(Path.cwd()) not in sys.path:  # a console script does not look there
             sys.path.append(str(Path.cwd()))
         return dataclasses.replace(_imported(name), name=name)
-    raise unknown_name(
-        "environment", name, [spec.env_id for spec in specs] if "/" in name else env_names()
-    )
+    raise unknown_name("environment", name, by_id if "/" in name else env_names())
 
 
 @functools.cache

@@ -9,7 +9,7 @@ import pytest
 from env_helpers import ROBOTS, actions_of
 
 from headway import envs
-from headway.envs.locomotion import load_model
+from headway.worlds.locomotion import load_model
 
 
 def stepped(env, state, action, **sim_params):

@@ -7,8 +7,8 @@ import pytest
 from env_helpers import NAMES, ROBOTS, actions_of
 
 from headway import envs
-from headway.envs import rendering
 from headway.errors import BadEnvironmentError
+from headway.worlds import rendering
 
 HAS_OPENGL = any(ctypes.util.find_library(name) for name in ("EGL", "OSMesa"))
 needs_opengl = pytest.mark.skipif(not HAS_OPENGL, reason="no EGL or OSMesa library installed")

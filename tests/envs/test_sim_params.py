@@ -24,6 +24,13 @@ def test_groups_are_all_combinations_and_samples_uniform():
     assert SimParamSets.from_dict(json.loads(json.dumps(SETS.to_dict()))) == SETS
 
 
+def test_values_may_be_lists_and_numpys_arrays_and_numbers():
+    train = {"mass": [np.float32(1), 2], "length": np.linspace(0.5, 3.0, 2)}
+    sets = SimParamSets(train, {"low": {"mass": [0.1, 0.2], "length": (np.float64(0.5),)}})
+    assert sets == SETS
+    assert {type(value) for group in sets.group("train") for value in group.values()} == {float}
+
+
 @pytest.mark.parametrize(
     "values",
     [
@@ -34,6 +41,7 @@ def test_groups_are_all_combinations_and_samples_uniform():
         {"train": {"mass": [float("nan")]}},
         {"train": {"mass": ["1"]}},
         {"train": {"mass": [True]}},
+        {"train": {"mass": np.ones((2, 2))}},
         {"train": {"mass": [1.0]}, "unsen": {}},
         {"train": {"mass": [1.0]}, "unseen": [1]},
         {"train": {"mass": [1.0]}, "unseen": {"train": {"mass": [1.0]}}},

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from headway import envs
-from headway.envs.classic import PendulumTask
-from headway.envs.locomotion import HalfCheetahTask, HopperTask, SlimHumanoidTask
 from headway.errors import ConfigError, UnknownNameError
 from headway.sim_params import SimParamSets
 from headway.task import EnvSpec, env_names, env_spec, register
+from headway.worlds.classic import PendulumTask
+from headway.worlds.locomotion import HalfCheetahTask, HopperTask, SlimHumanoidTask
 
 
 def task_of(name, **options):
@@ -204,7 +204,7 @@ PACKAGE = """
 import gymnasium
 import misbehaving
 from headway import EnvSpec, SimParamSets
-from headway.envs.classic import PendulumTask
+from headway.worlds.classic import PendulumTask
 
 gymnasium.register("own/Cart-v0", misbehaving.Drift)
 

@@ -3,24 +3,18 @@
 import gymnasium
 import numpy as np
 import pytest
-from env_helpers import NAMES, all_physics, distinct_physics
+from env_helpers import NAMES, ROBOTS, distinct_physics
 from gymnasium.vector import AutoresetMode
 
 import misbehaving
 from headway import envs
 from headway.envs import ClassicVectorEnv, RobotVectorEnv, SequentialVectorEnv
-from headway.envs.classic import PendulumTask
-from headway.errors import BadEnvironmentError, BrokenEpisodeError, ConfigError, UnknownNameError
+from headway.errors import ConfigError, UnknownNameError
 from headway.sim_params import SimParamSets
 from headway.task import EnvSpec, env_spec
+from headway.worlds.classic import PendulumTask
 
 NUM = 5
-
-
-def sequential(name, mode=AutoresetMode.NEXT_STEP, length=None, **options):
-    length = length or env_spec(name).episode_length
-    one = lambda: envs.make(name, max_episode_steps=length, **options)  # noqa: E731
-    return SequentialVectorEnv([one] * NUM, autoreset_mode=mode, episode_length=length)
 
 
 def assert_same(left, right):
@@ -32,83 +26,51 @@ def assert_same(left, right):
         np.testing.assert_array_equal(values, right[-1]["sim_params"][name])
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_equals_stepping_one_by_one(name):
-    """Over three episodes each, all kinds of physics and actions, and seeds as in Gymnasium."""
-    together, apart = envs.make_vec(name, NUM, episode_length=75), sequential(name, length=75)
-    options = {"sim_params": distinct_physics(name, NUM)}
-    assert_same(together.reset(seed=11, options=options), apart.reset(seed=11, options=options))
-    space = together.action_space
-    space.seed(0)
-    for step in range(210):
-        actions = space.sample()
-        if step % 3 == 0:
-            actions = np.where(actions > 0, space.high, space.low)
-        left = together.step(actions)
-        assert_same(left, apart.step(actions))
-        assert left[3].all() == (step in (74, 150))
-    kept = left[0].copy()
-    together.step(actions)
-    np.testing.assert_array_equal(left[0], kept)  # returned arrays are the caller's
-    assert isinstance(together, RobotVectorEnv if name in NAMES[2:] else ClassicVectorEnv)
-    together.close()
+CASES = [(name, {}, 8) for name in NAMES]
+CASES += [("cartpole-swingup", {"terminate_off_track": True}, 500)]
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_reset_mask_resets_only_the_chosen(name):
-    disabled = AutoresetMode.DISABLED
-    together = envs.make_vec(name, NUM, episode_length=8, autoreset_mode=disabled)
-    apart = sequential(name, disabled, 8)
-    physics = distinct_physics(name, NUM)
-    assert_same(*(v.reset(seed=3, options={"sim_params": physics}) for v in (together, apart)))
-    rng = np.random.default_rng(0)
+@pytest.mark.parametrize(("name", "options", "length"), CASES)
+def test_equals_stepping_one_by_one(name, options, length):
+    """Over some episodes each, all kinds of physics and actions, and seeds as in Gymnasium.
+
+    Finished ones stand still until they are reset, which leaves the others as they are.
+    """
+    together = envs.make_vec(name, NUM, episode_length=length, options=options)
+    one = lambda: envs.make(name, max_episode_steps=length, **options)  # noqa: E731
+    apart = SequentialVectorEnv([one] * NUM, episode_length=length)
+    assert isinstance(together, RobotVectorEnv if name in ROBOTS else ClassicVectorEnv)
+    assert together.metadata["autoreset_mode"] is AutoresetMode.DISABLED
+    physics = {"sim_params": distinct_physics(name, NUM)}
+    assert_same(*(vector.reset(seed=11, options=physics) for vector in (together, apart)))
+    rng, space = np.random.default_rng(0), together.action_space
     for _ in range(4):
-        for _ in range(10):  # two steps beyond the end of the first episode
-            actions = together.action_space.sample()
+        over = np.zeros(NUM, bool)
+        for step in range(10 if length < 10 else 250):  # also beyond the end
+            actions = rng.uniform(space.low, space.high) if step % 2 else space.high
             before = together.step(actions)
             assert_same(before, apart.step(actions))
+            assert not before[1][over].any()
+            over = before[2] | before[3]
+        assert over.all()
         mask = rng.random(NUM) < 0.5
         options = {"reset_mask": mask, "sim_params": {}}
+        kept = before[0].copy()
         after = together.reset(options=options)
         assert_same(after, apart.reset(options=options))
         np.testing.assert_array_equal(after[0][~mask], before[0][~mask])
+        np.testing.assert_array_equal(before[0], kept)  # returned arrays are the caller's
+        options = {"reset_mask": over & ~mask, "sim_params": {}}
+        assert_same(*(vector.reset(options=options) for vector in (together, apart)))
     together.close()
 
 
-def test_early_endings_restart_only_their_own_environment():
-    options = {"terminate_off_track": True}
-    together = envs.make_vec("cartpole-swingup", NUM, options=options)
-    apart = sequential("cartpole-swingup", **options)
-    assert_same(together.reset(seed=0), apart.reset(seed=0))
-    ends = []
-    for _ in range(250):
-        actions = np.ones((NUM, 1), np.float32)
-        left = together.step(actions)
-        assert_same(left, apart.step(actions))
-        ends.append(left[2])
-    assert (np.sum(ends, 0) > 1).all()
-    assert any(0 < row.sum() < NUM for row in ends)
-
-
-def test_finished_environments_stand_still_without_autoreset():
-    env = SequentialVectorEnv(
-        [lambda: misbehaving.Drift("end", at=2), misbehaving.Drift], autoreset_mode="Disabled"
-    )
-    env.reset(seed=0)
-    rows = [env.step(np.ones((2, 1), np.float32))[:4] for _ in range(4)]
-    assert [reward.tolist() for _, reward, *_ in rows] == [[1, 1], [1, 1], [0, 1], [0, 1]]
-    assert [ends[0] for *_, ends, _ in rows] == [False, True, True, True]
-    np.testing.assert_array_equal(rows[3][0][0], rows[1][0][0])
-
-
-def test_gymnasium_makes_the_same_vector_environment():
-    vector = gymnasium.make_vec(
-        "headway/Hopper-v0", 2, vectorization_mode="vector_entry_point", scale_inertia=True
-    )
-    assert isinstance(vector, RobotVectorEnv)
-    assert vector.episode_length == 500
-    assert vector.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
-    vector.close()
+def test_gymnasium_makes_many_that_are_reset_by_themselves():
+    vector = gymnasium.make_vec("headway/Pendulum-v0", 2, max_episode_steps=3)
+    vector.reset(seed=0, options={"sim_params": {"length": 2.0}})
+    rows = [vector.step(vector.action_space.sample()) for _ in range(4)]
+    assert [row[3].tolist() for row in rows] == [[False] * 2] * 2 + [[True] * 2, [False] * 2]
+    assert [2.0 in row[4]["sim_params"]["length"] for row in rows] == [True] * 3 + [False]
 
 
 def test_own_physics_sets_and_a_single_value_for_all():
@@ -120,22 +82,29 @@ def test_own_physics_sets_and_a_single_value_for_all():
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("options", "says"),
     [
-        {"sim_params": {"lenght": np.ones(3)}},
-        {"sim_params": {"length": np.ones(2)}},
-        {"sim_params": {"length": np.array([1.0, np.nan, 1.0])}},
-        {"sim_params": {"length": np.array(["a", "b", "c"])}},
-        {"sim_params": 3},
-        {"reset_mask": np.ones(2, bool)},
-        {"reset_mask": np.ones(3)},
-        {"reset_masks": np.ones(3, bool)},
+        ({"sim_params": {"lenght": np.ones(3)}}, "Did you mean 'length'"),
+        ({"sim_params": {"length": np.ones(2)}}, "one per environment"),
+        ({"sim_params": {"length": np.array([1.0, np.nan, 1.0])}}, "above 0"),
+        ({"sim_params": {"length": np.array(["a", "b", "c"])}}, "above 0"),
+        ({"sim_params": 3}, "by parameter name"),
+        ({"reset_mask": np.ones(2, bool)}, "3 booleans"),
+        ({"reset_mask": np.ones(3)}, "3 booleans"),
+        ({"reset_masks": np.ones(3, bool)}, "Did you mean 'reset_mask'"),
+        ({"schedule": {-1: {"length": 1.0}}}, "whole numbers"),
+        ({"schedule": {"soon": {"length": 1.0}}}, "whole numbers"),
+        ({"schedule": {1: {"lenght": 1.0}}}, "Did you mean 'length'"),
+        ({"schedule": {1: {"length": -1.0}}}, "above 0"),
+        ({"schedule": {1: 2.0}}, "by parameter name"),
+        ({"schedule": [{}]}, "one per"),
+        ({"schedule": 3}, "mapping"),
     ],
 )
-def test_bad_options_are_refused_and_change_nothing(options):
+def test_bad_options_are_refused_in_one_line_and_change_nothing(options, says):
     vector = envs.make_vec("pendulum", 3)
     obs, info = vector.reset(seed=0)
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(ConfigError, match=says) as caught:
         vector.reset(seed=1, options=options)
     assert "\n" not in str(caught.value)
     np.testing.assert_array_equal(vector.observe(), obs)
@@ -146,8 +115,6 @@ def test_bad_arguments_are_refused():
     for arguments in ({"num_envs": 0}, {"num_envs": 1, "episode_length": 0}):
         with pytest.raises(ConfigError):
             envs.make_vec("pendulum", **arguments)
-    with pytest.raises(ConfigError, match="SAME_STEP"):
-        envs.make_vec("pendulum", 1, autoreset_mode=AutoresetMode.SAME_STEP)
     with pytest.raises(UnknownNameError, match="Did you mean 'scale_inertia'"):
         envs.make_vec("hopper", 1, options={"scale_inertias": True})
     separate = [lambda: gymnasium.make("Pendulum-v1")] * 2
@@ -177,26 +144,11 @@ def test_a_simulation_that_diverges_costs_its_own_episode_only(tmp_path, monkeyp
     for bad in (truncated, np.isnan(obs).all(1), np.isnan(reward)):
         assert np.flatnonzero(bad).tolist() == [1]
     np.testing.assert_array_equal(np.delete(obs, 1, 0), np.delete(plain.step(action)[0], 1, 0))
-    obs, _, _, _, info = vector.step(action)  # the next episode begins
+    obs, info = vector.reset(options={"reset_mask": truncated})
     assert "broken" not in info
     assert np.isfinite(obs).all()
     vector.close()
     plain.close()
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_physics_differ_between_neighbours(name):
-    """From equal states under equal actions, every environment goes its own way."""
-    number = len(all_physics(name))
-    vector = envs.make_vec(name, number)
-    options = {"sim_params": distinct_physics(name, number)}
-    start, _ = vector.reset(seed=[7] * number, options=options)
-    np.testing.assert_array_equal(start, np.broadcast_to(start[0], start.shape))
-    for _ in range(10):
-        obs = vector.step(vector.action_space.high)[0]
-    gaps = np.abs(obs[:, None] - obs[None]).max(-1)[np.triu_indices(number, 1)]
-    assert gaps.min() > 1e-6
-    vector.close()
 
 
 gymnasium.register("own/VectorDrift-v0", "misbehaving:Drift")
@@ -224,9 +176,7 @@ def test_environments_of_ones_own():
         np.testing.assert_array_equal(rewards, [0, 1, 2])
         assert (terminated.any(), truncated.all()) == (False, step == 5)
     assert np.abs(obs - start).min() > 0
-    info = vector.step(actions)[-1]  # the next episodes begin
-    drawn = {*info["sim_params"]["drift"]}
-    drawn |= {float(vector.reset(seed=s)[1]["sim_params"]["drift"][0]) for s in range(20)}
+    drawn = {float(vector.reset(seed=s)[1]["sim_params"]["drift"][0]) for s in range(20)}
     assert drawn == {1.0, 2.0}
     first = vector.reset(seed=4)[1]["sim_params"]["drift"]
     np.testing.assert_array_equal(vector.reset(seed=4)[1]["sim_params"]["drift"], first)
@@ -242,45 +192,42 @@ def test_own_physics_under_another_name_steps_as_fast():
     vector.close()
 
 
-@pytest.mark.parametrize(
-    ("how", "says"),
-    [
-        ("shrink", r"obs of shape \(2,\), allowed: \(3,\)"),
-        ("lose_the_reward", "reward None, allowed: a number"),
-    ],
-)
-def test_misshapen_results_are_named(how, says):
-    env = SequentialVectorEnv([lambda: misbehaving.Drift(how, at=1)])
-    env.reset(seed=0)
-    with pytest.raises(BadEnvironmentError, match=says):
-        env.step(np.zeros((1, 1), np.float32))
+CHANGES = {
+    "pendulum": ({"length": 1.0, "mass": 1.0}, {"length": 0.5}),
+    "half-cheetah": ({"mass_scale": 1.0, "damping_scale": 1.0}, {"mass_scale": 2.5}),
+    "crippled-ant": ({"crippled_leg": 0}, {"crippled_leg": 2}),
+}
 
 
-def test_a_next_episode_that_cannot_begin_is_cut_and_tried_again():
-    class Falls(misbehaving.Drift):
-        def reset(self, **given):
-            if self.elapsed:
-                self.elapsed = 0
-                raise BrokenEpisodeError("it fell over")
-            return super().reset(**given)
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_schedule_changes_the_physics_at_its_step_of_its_environment_only(name):
+    before, change = CHANGES[name]
+    env, one = envs.make_vec(name, 2), envs.make(name)
+    actions = np.random.default_rng(0).uniform(-1, 1, (6, *env.action_space.shape))
+    runs = []
+    for schedule in (None, [{3: change}, {}], None):  # and the next episode knows nothing of it
+        env.reset(seed=[7, 8], options={"sim_params": before, "schedule": schedule})
+        runs.append(np.stack([env.step(action)[0] for action in actions]))
+        for parameter, value in change.items():
+            now = value if schedule else before[parameter]
+            assert env.sim_params[parameter].tolist() == [now, before[parameter]]
+    np.testing.assert_array_equal(runs[0], runs[2])
+    same = (runs[0] == runs[1]).all(-1)
+    assert same[:, 1].all()
+    assert same[:3, 0].all()
+    assert not same[3:, 0].any()
+    one.reset(seed=7, options={"sim_params": before, "schedule": {3: change}})
+    alone = np.stack([one.step(action)[0] for action in actions[:, 0]])
+    np.testing.assert_array_equal(alone, runs[1][:, 0])
 
-    vector = SequentialVectorEnv([Falls, misbehaving.Drift], episode_length=2)
-    vector.reset(seed=0)
-    ones = np.ones((2, 1), np.float32)
-    for _ in range(2):
-        vector.step(ones)
-    obs, reward, _, truncated, info = vector.step(ones)
-    assert info["broken"] == {0: "it fell over"}
-    assert np.isnan(obs).any(1).tolist() == [True, False]
-    assert np.isnan(reward).tolist() == truncated.tolist() == [True, False]
-    obs, reward, _, truncated, info = vector.step(ones)  # begins at last
-    assert "broken" not in info
-    assert np.isfinite(obs).all()
-    assert (reward.tolist(), truncated.tolist()) == ([0.0, 1.0], [False, False])
 
-
-@pytest.mark.parametrize("how", ["change_spaces", "change_actions"])
-def test_spaces_must_stay_as_they_are(how):
-    vector = SequentialVectorEnv([lambda: misbehaving.Drift(how, at=0), misbehaving.Drift])
-    with pytest.raises(BadEnvironmentError, match=r"space .*allowed: .* in every episode"):
-        vector.reset(seed=0)
+def test_environments_of_ones_own_change_if_they_can():
+    plain = SequentialVectorEnv([lambda: gymnasium.make("Pendulum-v1")])
+    plain.reset(options={"schedule": {0: {"length": 1.0}}})
+    with pytest.raises(ConfigError, match="set_sim_params"):
+        plain.step(np.zeros((1, 1), np.float32))
+    env = SequentialVectorEnv([misbehaving.Drift, misbehaving.Drift])
+    env.reset(options={"schedule": [{1: {"drift": 2.0}}, {}]})
+    steps = [env.step(np.zeros((2, 1)))[-1]["sim_params"]["drift"].tolist() for _ in range(2)]
+    assert steps == [[0.5, 0.5], [2.0, 0.5]]
+    assert env.envs[0].drift == 2.0

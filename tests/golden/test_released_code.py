@@ -15,7 +15,6 @@ import pytest
 
 from headway.config import FittingConfig
 from headway.data import History, segment_sums
-from headway.envs.locomotion import HalfCheetahTask
 from headway.models.losses import (
     Assignment,
     Batch,
@@ -29,6 +28,7 @@ from headway.models.losses import (
 )
 from headway.models.multi_headed import MultiHeadDynamics, Statistics
 from headway.models.networks import ContextEncoder, Dense, DenseHeads, GaussianNet, Normalizer
+from headway.worlds.locomotion import HalfCheetahTask
 
 SEGMENT = 10
 NUM_HEADS = 3

@@ -9,13 +9,13 @@ import pytest
 import headway
 import runs
 from headway import task
-from headway.envs.classic import PendulumTask
 from headway.errors import BadEnvironmentError
 from headway.sim_params import SimParamSets
 from headway.task import EnvSpec, register
 from headway.training.collect import Environments, Episode, random_policy, run_episodes
 from headway.training.run import RunDir
 from headway.training.train import train_run
+from headway.worlds.classic import PendulumTask
 
 FAR = 5.0
 """Physics of the tests only."""

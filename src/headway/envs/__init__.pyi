@@ -5,12 +5,6 @@ from .built_in import HeadwayEnv as HeadwayEnv
 from .built_in import RobotVectorEnv as RobotVectorEnv
 from .built_in import make as make
 from .built_in import make_vec as make_vec
-from .classic import CartPoleSwingUp as CartPoleSwingUp
-from .classic import Pendulum as Pendulum
-from .locomotion import CrippledAnt as CrippledAnt
-from .locomotion import HalfCheetah as HalfCheetah
-from .locomotion import Hopper as Hopper
-from .locomotion import SlimHumanoid as SlimHumanoid
 from .vector import HeadwayVectorEnv as HeadwayVectorEnv
 from .vector import ProcessVectorEnv as ProcessVectorEnv
 from .vector import SequentialVectorEnv as SequentialVectorEnv

@@ -1,9 +1,10 @@
 # pyright: reportAttributeAccessIssue=false
 # (the names compiled into mujoco have no stubs)
 
-"""The paper's six environments for Gymnasium, one or many; importing this registers their ids."""
+"""The paper's six environments for Gymnasium, one or many."""
 
 import abc
+import copy
 import functools
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,80 +12,71 @@ from typing import Any
 
 import gymnasium
 import mujoco
+import mujoco.rollout
 import numpy as np
 from gymnasium.spaces import Box
-from gymnasium.utils import seeding
-from gymnasium.vector import AutoresetMode
+from jaxtyping import Float
 
 from headway.cpus import num_cpus
-from headway.envs import classic, locomotion
-from headway.envs.classic import ClassicWorld
-from headway.envs.locomotion import Robot, RobotState
 from headway.envs.vector import (
+    Begun,
     HeadwayVectorEnv,
     Outcome,
     ProcessVectorEnv,
     SequentialVectorEnv,
     SimParams,
 )
-from headway.envs.world import World
 from headway.errors import BrokenEpisodeError, ConfigError
 from headway.sim_params import SimParamSets
-from headway.task import BUILT_IN, EnvSpec, env_spec
+from headway.task import env_spec
+from headway.worlds import classic, locomotion
+from headway.worlds.base import World
+from headway.worlds.classic import ClassicWorld
+from headway.worlds.locomotion import Robot, RobotState
 
-_WORLDS: tuple[type[World], ...] = (
-    classic.Pendulum,
-    classic.CartPoleSwingUp,
-    locomotion.Hopper,
-    locomotion.SlimHumanoid,
-    locomotion.HalfCheetah,
-    locomotion.CrippledAnt,
-)
+_WORLDS: Mapping[str, type[World]] = {
+    world.spec.env_id: world for world in (*classic.WORLDS, *locomotion.WORLDS)
+}
 
 
 class WorldVectorEnv(HeadwayVectorEnv):
     """Many copies of one world."""
 
-    def __init__(
-        self,
-        world: World,
-        num_envs: int,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        episode_length: int | None = None,
-    ):
-        task, high = world.task, world.obs_bounds().astype(world.obs_dtype)
-        low, upper = np.array(task.action_low, np.float32), np.array(task.action_high, np.float32)
-        spaces = Box(-high, high, dtype=world.obs_dtype), Box(low, upper, dtype=np.float32)
-        super().__init__(num_envs, spaces, autoreset_mode, episode_length)
+    def __init__(self, world: World, num_envs: int, episode_length: int | None = None):
+        task, dtype = world.task, world.obs_dtype
+        bounds = np.broadcast_to(world.obs_bounds, task.obs_size).astype(dtype)
+        low, high = np.array(task.action_low, np.float32), np.array(task.action_high, np.float32)
+        spaces = Box(-bounds, bounds, dtype=dtype), Box(low, high, dtype=np.float32)
+        super().__init__(num_envs, spaces, episode_length)
         self.world: Any = world
-        self.rngs: list[np.random.Generator | None] = [None] * num_envs
-        self._sim_params = {
-            name: np.full(num_envs, float(value))
-            for name, value in world.spec.default_sim_params.items()
-        }
+        for i in range(num_envs):
+            self._note_sim_params(i, world.spec.default_sim_params)
 
     def _check_actions(self, actions: np.ndarray) -> np.ndarray:
-        return self.world.clip(actions, self.num_envs)
+        actions = np.asarray(super()._check_actions(actions), np.float64)
+        if not np.isfinite(actions).all():
+            raise ConfigError(
+                f"{self.world.spec.name} was given the actions {actions.tolist()}, allowed: finite"
+                " numbers."
+            )
+        return np.clip(actions, self.action_space.low, self.action_space.high)
 
     def _check_sim_params(self, values: dict[str, Any]) -> SimParams:
         return self.world.check(values)
 
-    def _begin(
-        self, chosen: np.ndarray, seeds: Sequence[int | None], requested: Sequence[SimParams]
-    ) -> dict[int, SimParams | BrokenEpisodeError]:
-        begun: dict[int, SimParams | BrokenEpisodeError] = {}
-        for i in chosen.tolist():
-            rng = self.rngs[i]
-            if rng is None or seeds[i] is not None:
-                rng = self.rngs[i] = seeding.np_random(seeds[i])[0]
-            self._set_initial_state(i, rng)
-            begun[i] = sim_params = self.world.draw(rng, requested[i])
-            self._apply_sim_params(i, sim_params)
+    def _begin(self, seeds: Mapping[int, int | None], requested: Sequence[SimParams]) -> Begun:
+        begun: Begun = {}
+        for i in seeds:
+            self._set_state(i, self.world.initial_state(self.rngs[i]))
+            # What was requested is drawn all the same, so the next draws do not depend on it.
+            drawn = self.world.sim_params.sample(self.rngs[i])
+            begun[i] = sim_params = self.world.spec.default_sim_params | drawn | requested[i]
+            self.set_sim_params(i, sim_params)
         return begun
 
-    def _change(self, i: int, changed: SimParams) -> None:
-        before = {name: float(values[i]) for name, values in self._sim_params.items()}
-        self._apply_sim_params(i, before | changed)
+    def physics(self, i: int) -> SimParams:
+        """Simulator parameters of environment `i` now in force."""
+        return {name: float(values[i]) for name, values in self._sim_params.items()}
 
     def set_sim_params(self, i: int, values: Mapping[str, Any]) -> None:
         """Change some simulator parameters of environment `i`, and leave its state as it is.
@@ -93,8 +85,8 @@ class WorldVectorEnv(HeadwayVectorEnv):
             ConfigError: A parameter or value is not allowed.
         """
         checked = self.world.check(values)
-        self._change(i, checked)
         self._note_sim_params(i, checked)
+        self._change(i, checked)
 
     def set_state(self, i: int, state: np.ndarray) -> None:
         """Bring environment `i` to a state that `get_state` returned.
@@ -124,21 +116,14 @@ class WorldVectorEnv(HeadwayVectorEnv):
     def _set_state(self, i: int, state: np.ndarray) -> None:
         """Do what `set_state` says."""
 
-    @abc.abstractmethod
-    def _set_initial_state(self, i: int, rng: np.random.Generator) -> None:
-        """Put environment `i` into the state that an episode starts in."""
-
-    def _apply_sim_params(self, i: int, sim_params: SimParams) -> None:
-        """Change the physics of environment `i`; nothing to do where they are read."""
-
 
 class ClassicVectorEnv(WorldVectorEnv):
     """Many copies of a classic world, stepped by one NumPy formula."""
 
     world: ClassicWorld
 
-    def __init__(self, world: ClassicWorld, num_envs: int, *args: Any):
-        super().__init__(world, num_envs, *args)
+    def __init__(self, world: ClassicWorld, num_envs: int, episode_length: int | None = None):
+        super().__init__(world, num_envs, episode_length)
         self._state = np.zeros((num_envs, world.state_size))
         self._action = np.zeros((num_envs, world.task.action_size))
 
@@ -147,8 +132,8 @@ class ClassicVectorEnv(WorldVectorEnv):
         """The physical states [env, state] as they are now."""
         return self._state.copy()
 
-    def _set_initial_state(self, i: int, rng: np.random.Generator) -> None:
-        self._state[i], self._action[i] = self.world.initial_state(rng), 0.0
+    def _change(self, i: int, changed: SimParams) -> None:
+        """Nothing: the formula reads what is noted."""
 
     def _advance(self, active: np.ndarray, actions: np.ndarray) -> Outcome:
         sim_params = {name: values[active] for name, values in self._sim_params.items()}
@@ -157,7 +142,7 @@ class ClassicVectorEnv(WorldVectorEnv):
         self._state[active], self._action[active] = after, action
         terminated = self.world.terminated(after)
         reward = self.world.reward(state, action, after)
-        return reward, terminated, np.zeros(len(active), bool), {}
+        return reward, np.stack([terminated, np.zeros_like(terminated)]), {}
 
     def observe(self) -> np.ndarray:
         """Observe all states."""
@@ -168,12 +153,14 @@ class ClassicVectorEnv(WorldVectorEnv):
         return self._state[i].copy()
 
     def _set_state(self, i: int, state: np.ndarray) -> None:
-        self._state[i] = state
+        self._state[i], self._action[i] = state, 0.0
 
     def frame(self, i: int) -> np.ndarray:
         """Draw the state and the action that led to it."""
-        sim_params = {name: float(values[i]) for name, values in self._sim_params.items()}
-        return self.world.draw_frame(self._state[i], self._action[i], sim_params)
+        from headway.worlds import rendering
+
+        draw = rendering.DRAWINGS[self.world.spec.name]
+        return draw(self._state[i], float(self._action[i, 0]), self.physics(i))
 
 
 class RobotVectorEnv(WorldVectorEnv):
@@ -185,23 +172,17 @@ class RobotVectorEnv(WorldVectorEnv):
 
     world: Robot
 
-    def __init__(self, world: Robot, num_envs: int, *args: Any):
-        super().__init__(world, num_envs, *args)
-        self.models = [world.new_model() for _ in range(num_envs)]
+    def __init__(self, world: Robot, num_envs: int, episode_length: int | None = None):
+        super().__init__(world, num_envs, episode_length)
+        self.models = [copy.copy(world.nominal) for _ in range(num_envs)]
         self.datas = [mujoco.MjData(model) for model in self.models]
         self.velocity = np.zeros(num_envs)
         self._num_threads = min(num_cpus(), num_envs)
         self._pool = ThreadPoolExecutor(self._num_threads)
         self._renderers: dict[int, Any] = {}
 
-    def _set_initial_state(self, i: int, rng: np.random.Generator) -> None:
-        data = self.datas[i]
-        mujoco.mj_resetData(self.models[i], data)
-        data.qpos[:], data.qvel[:] = self.world.initial_state(rng)
-        self.velocity[i] = 0.0
-
-    def _apply_sim_params(self, i: int, sim_params: SimParams) -> None:
-        self.world.set_physics(self.models[i], sim_params)
+    def _change(self, i: int, changed: SimParams) -> None:
+        self.world.set_physics(self.models[i], self.physics(i))
 
     def _advance(self, active: np.ndarray, actions: np.ndarray) -> Outcome:
         def step(share: np.ndarray) -> None:
@@ -212,18 +193,21 @@ class RobotVectorEnv(WorldVectorEnv):
         control = self.world.control(actions, self._sim_params)
         for data, row in zip(self.datas, control, strict=True):
             data.ctrl[:] = row
-        shares = np.array_split(active, self._num_threads)
-        waiting = [self._pool.submit(step, share) for share in shares[1:] if share.size]
-        step(shares[0])  # in this thread
-        for future in waiting:
-            future.result()
+        first, *others = np.array_split(active, min(len(active), self._num_threads))
+        begun = self._pool.map(step, others)
+        step(first)  # in this thread, meanwhile
+        list(begun)  # wait for the others
         qpos, qvel, _ = self._robot_state()
         after = self.world.after_step(before, qpos, qvel)
         self.velocity[active] = after.velocity[active]
         reward = self.world.reward(before, actions, after)[active]
-        warnings = {i: self.world.warning(self.datas[i]) for i in active.tolist()}
-        never = np.zeros(len(active), bool)
-        return reward, never, never, {i: why for i, why in warnings.items() if why}
+        broken = {}
+        for i in active.tolist():  # after huge numbers MuJoCo quietly starts over, but warns
+            counts = self.datas[i].warning.number
+            if counts.any():
+                name = mujoco.mjtWarning(int(np.argmax(counts))).name.removeprefix("mjWARN_")
+                broken[i] = f"the simulation of {self.world.spec.name} diverged ({name})"
+        return reward, np.zeros((2, len(active)), bool), broken
 
     def _robot_state(self) -> RobotState:
         qpos = np.array([data.qpos for data in self.datas])
@@ -240,10 +224,63 @@ class RobotVectorEnv(WorldVectorEnv):
 
     def _set_state(self, i: int, state: np.ndarray) -> None:
         data, (nq, nv) = self.datas[i], (self.world.nominal.nq, self.world.nominal.nv)
-        data.warning.number[:] = 0  # they are of where it was before
+        mujoco.mj_resetData(self.models[i], data)
         data.qpos[:], data.qvel[:], data.qacc_warmstart[:], self.velocity[i : i + 1] = np.split(
             state, [nq, nq + nv, nq + 2 * nv]
         )
+
+    @functools.cached_property
+    def _rollout(self) -> tuple[Any, list[Any], Any]:
+        """A model, a state per thread, and the threads of `mujoco.rollout`, one per CPU."""
+        model = copy.copy(self.world.nominal)
+        # A robot that MuJoCo gives up on stays where it is instead of starting over.
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET.value
+        threads = num_cpus()
+        datas = [mujoco.MjData(model) for _ in range(threads)]
+        return model, datas, mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0)
+
+    def roll_out(
+        self, i: int, actions: Float[np.ndarray, "candidate horizon action"]
+    ) -> tuple[RobotState, RobotState]:
+        """Return the states before and after every step, [candidate, horizon, ...].
+
+        The environments themselves are not touched. A future repeats what they will do to the
+        bit: same physics, same constraint solver's warm start. Where MuJoCo gives up on a
+        sequence, its states are NaN.
+
+        Args:
+            i: The environment to start from.
+            actions: In the environment's own units, within its bounds.
+        """
+        world, data, sim_params = self.world, self.datas[i], self.physics(i)
+        model, datas, rollout = self._rollout
+        world.set_physics(model, sim_params)
+        count, horizon = actions.shape[:2]
+        skip, nq, nv = world.frame_skip, model.nq, model.nv
+        full_physics = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
+        start = np.empty(mujoco.mj_stateSize(model, full_physics))
+        mujoco.mj_getState(self.models[i], data, start, full_physics)
+        found, _ = rollout.rollout(
+            model,
+            datas,
+            np.tile(start, (count, 1)),
+            np.repeat(world.control(actions, sim_params), skip, axis=1),
+            control_spec=mujoco.mjtState.mjSTATE_CTRL.value,
+            initial_warmstart=np.tile(data.qacc_warmstart, (count, 1)),
+        )
+        states = np.asarray(found)
+        # Given up: numbers too large for MuJoCo, or its clock, the first of them, stands still.
+        end = start[0] + (states.shape[1] - 0.5) * model.opt.timestep
+        sound = (np.abs(states) < mujoco.mjMAXVAL).all((1, 2)) & (states[:, -1, 0] > end)
+        states[~sound] = np.nan
+        first = np.broadcast_to(start, (count, 1, len(start)))
+        reached = np.concatenate([first, states[:, skip - 1 :: skip]], axis=1)
+        qpos, qvel = reached[..., 1 : 1 + nq], reached[..., 1 + nq : 1 + nq + nv]
+        before = RobotState(qpos[:, :-1], qvel[:, :-1], np.zeros((count, horizon)))
+        after = world.after_step(before, qpos[:, 1:], qvel[:, 1:])
+        now = np.full((count, 1), self.velocity[i])
+        velocity = np.concatenate([now, after.velocity[:, :-1]], axis=1)
+        return before._replace(velocity=velocity), after
 
     def frame(self, i: int) -> np.ndarray:
         """Draw the robot.
@@ -251,7 +288,7 @@ class RobotVectorEnv(WorldVectorEnv):
         Raises:
             BadEnvironmentError: No OpenGL library for drawing without a screen was found.
         """
-        from headway.envs.rendering import RobotRenderer
+        from headway.worlds.rendering import RobotRenderer
 
         if i not in self._renderers:
             self._renderers[i] = RobotRenderer(self.models[i], self.world.camera)
@@ -262,21 +299,6 @@ class RobotVectorEnv(WorldVectorEnv):
         self._pool.shutdown()
         while self._renderers:
             self._renderers.popitem()[1].close()
-
-
-def built_in_vec(
-    name: str,
-    num_envs: int = 1,
-    *,
-    sim_params: SimParamSets | None = None,
-    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-    max_episode_steps: int | None = None,
-    **options: bool,
-) -> WorldVectorEnv:
-    """Make many copies of a built-in environment; `gymnasium.make_vec` calls it."""
-    world = _WORLDS[BUILT_IN.index(name)](sim_params, **options)
-    kind: Any = RobotVectorEnv if isinstance(world, Robot) else ClassicVectorEnv
-    return kind(world, num_envs, autoreset_mode, max_episode_steps)
 
 
 class HeadwayEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -303,9 +325,7 @@ class HeadwayEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     ):
         if render_mode not in (None, "rgb_array"):
             raise ConfigError(f"render_mode is {render_mode!r}, allowed: None or 'rgb_array'.")
-        self.vector: Any = built_in_vec(
-            name, sim_params=sim_params, autoreset_mode=AutoresetMode.DISABLED, **options
-        )
+        self.vector: Any = _vector(_WORLDS[env_spec(name).env_id](sim_params, **options), 1)
         self.render_mode = render_mode
         self.metadata = self.metadata | {"render_fps": round(1 / self.vector.world.time_step)}
         self.action_space = self.vector.single_action_space
@@ -314,7 +334,7 @@ class HeadwayEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     @property
     def sim_params(self) -> SimParams:
         """The simulator parameters now in force."""
-        return {name: float(values[0]) for name, values in self.vector.sim_params.items()}
+        return self.vector.physics(0)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -399,10 +419,7 @@ def make(name: str, **kwargs: Any) -> gymnasium.Env:
     Raises:
         UnknownNameError: No such environment or option.
     """
-    spec = env_spec(name)
-    if _built_in(spec) is not None:
-        kwargs.setdefault("disable_env_checker", True)
-    return gymnasium.make(spec.env_id, **kwargs)
+    return gymnasium.make(env_spec(name).env_id, **kwargs)
 
 
 def make_vec(
@@ -411,18 +428,18 @@ def make_vec(
     *,
     sim_params: SimParamSets | None = None,
     options: Mapping[str, bool] | None = None,
-    autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     episode_length: int | None = None,
     step_timeout_s: float | None = None,
 ) -> HeadwayVectorEnv:
     """Make many environments that step together, each with physics of its own.
+
+    Finished ones wait for `reset`; `gymnasium.make_vec` makes ones that are reset by themselves.
 
     Args:
         name: For example `"hopper"`, `"headway/Hopper-v0"` or `"my_package:cart"`.
         num_envs: How many.
         sim_params: Replaces the spec's training and unseen physics.
         options: Boolean options of the environment.
-        autoreset_mode: NEXT_STEP or DISABLED, see `HeadwayVectorEnv`.
         episode_length: Steps after which an episode is cut; None takes the spec's.
         step_timeout_s: Steps every environment in a process of its own, and gives it up when a
             step takes longer (`ProcessVectorEnv`); None steps all in this process.
@@ -436,35 +453,22 @@ def make_vec(
     given: dict[str, Any] = dict(options or {})
     sets = sim_params or spec.sim_params
     length = spec.episode_length if episode_length is None else episode_length
-    shared: dict[str, Any] = {"autoreset_mode": autoreset_mode}
-    built_in = _built_in(spec)
-    if built_in is not None and step_timeout_s is None:
-        return built_in_vec(
-            built_in, num_envs, sim_params=sets, max_episode_steps=length, **shared, **given
-        )
-    if built_in is not None:  # these draw physics themselves
-        given |= {"sim_params": sets, "disable_env_checker": True}
-    else:
-        shared["sim_params"] = sets
+    world, draws = _WORLDS.get(spec.env_id), None
+    if world is not None and step_timeout_s is None:
+        return _vector(world(sets, **given), num_envs, length)
+    if world is None:
+        draws = sets
+    else:  # these draw physics themselves
+        given["sim_params"] = sets
     # A longer episode than Gymnasium's own limit must be possible, so ours replaces it.
     registered = gymnasium.spec(spec.env_id)  # another process may not have registered it
     one = functools.partial(gymnasium.make, registered, max_episode_steps=length, **given)
-    shared |= {"env_fns": [one] * num_envs, "episode_length": length}
+    shared: dict[str, Any] = {"sim_params": draws, "episode_length": length}
     if step_timeout_s is None:
-        return SequentialVectorEnv(**shared)
-    return ProcessVectorEnv(step_timeout_s=step_timeout_s, **shared)
+        return SequentialVectorEnv([one] * num_envs, **shared)
+    return ProcessVectorEnv([one] * num_envs, step_timeout_s=step_timeout_s, **shared)
 
 
-def _built_in(spec: EnvSpec) -> str | None:
-    """Return the built-in environment that a spec is about, maybe with physics of its own."""
-    return next((name for name in BUILT_IN if env_spec(name).env_id == spec.env_id), None)
-
-
-for _name in BUILT_IN:
-    gymnasium.register(
-        env_spec(_name).env_id,
-        entry_point="headway.envs.built_in:HeadwayEnv",
-        vector_entry_point="headway.envs.built_in:built_in_vec",
-        max_episode_steps=env_spec(_name).episode_length,
-        kwargs={"name": _name},
-    )
+def _vector(world: World, num_envs: int, episode_length: int | None = None) -> WorldVectorEnv:
+    kind: Any = RobotVectorEnv if isinstance(world, Robot) else ClassicVectorEnv
+    return kind(world, num_envs, episode_length)

@@ -9,7 +9,6 @@ import multiprocessing
 import os
 import signal
 import time
-import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +16,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.error import NoAsyncCallError
 from gymnasium.utils import seeding
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -33,10 +33,13 @@ from headway.sim_params import SimParamSets
 SimParams = dict[str, float]
 Schedule = Mapping[int, Mapping[str, float]]
 """New simulator parameters by the step before which they come into force; 0 is the first."""
-
-
-Outcome = tuple[np.ndarray, np.ndarray, np.ndarray, dict[int, str]]
-"""Reward, terminated and truncated of some environments; which episodes cannot go on, and why."""
+Spaces = tuple[gymnasium.Space, gymnasium.Space]
+"""Observation and action space."""
+Begun = dict[int, SimParams | BrokenEpisodeError]
+"""Simulator parameters of the episodes that began by environment, or why one cannot begin."""
+Outcome = tuple[np.ndarray, np.ndarray, dict[int, str]]
+"""Reward [env] and ends [2 (terminated, truncated), env] of those that were stepped; which
+episodes cannot go on, and why."""
 
 
 class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -51,38 +54,29 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
       they do, `{100: {"mass_scale": 2.0}}`; one for all environments or a list of one for each;
     - `"reset_mask"`: which environments are reset; the others go on as they are.
 
-    With `AutoresetMode.NEXT_STEP` the step after the end of an episode ignores its action,
-    starts the next episode with physics drawn from the training values, and pays 0. With
-    `AutoresetMode.DISABLED` a finished environment stands still, pays 0 and repeats its last
-    observation and flags until it is reset.
+    Nothing is reset by itself (`AutoresetMode.DISABLED`): a finished environment stands still,
+    pays 0 and repeats its last observation and flags until it is reset.
 
     An episode that breaks (a simulation diverged, a process hung) does not disturb the others:
     it is truncated, pays NaN, has NaN as its last observation, and `info["broken"]` says why,
     by environment.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (as in Gymnasium)
+    metadata: dict[str, Any] = {  # noqa: RUF012 (as in Gymnasium)
+        "render_modes": [],
+        "autoreset_mode": AutoresetMode.DISABLED,
+    }
 
-    def __init__(
-        self,
-        num_envs: int,
-        spaces: tuple[gymnasium.Space, gymnasium.Space],
-        autoreset_mode: AutoresetMode | str,
-        episode_length: int | None,
-    ):
+    def __init__(self, num_envs: int, spaces: Spaces, episode_length: int | None):
         if num_envs < 1 or (episode_length is not None and episode_length < 1):
             raise ConfigError(
                 f"num_envs is {num_envs} and episode_length {episode_length}, allowed: at least 1."
             )
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
-        if self.autoreset_mode is AutoresetMode.SAME_STEP:
-            raise ConfigError("autoreset_mode is SAME_STEP, allowed: NEXT_STEP or DISABLED.")
-        self.num_envs = num_envs
+        self.num_envs, self.episode_length = num_envs, episode_length
         self.single_observation_space, self.single_action_space = spaces
         self.observation_space = batch_space(spaces[0], num_envs)
         self.action_space = batch_space(spaces[1], num_envs)
-        self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode}
-        self.episode_length = episode_length
+        self.rngs: list[Any] = [None] * num_envs  # generators, once they are seeded
         self._elapsed = np.zeros(num_envs, int)
         self._ends = np.zeros((2, num_envs), bool)  # terminated, truncated
         self._broken: dict[int, str] = {}
@@ -106,19 +100,31 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 raise ConfigError(str(unknown_name("reset option", str(name), known)))
         if seed is None or isinstance(seed, int | np.integer):
             seed = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+        seed = [None if own is None else int(own) for own in seed]
         if len(seed) != self.num_envs:
             raise ConfigError(
                 f"seed has {len(seed)} entries, allowed: an int, or {self.num_envs} of them."
             )
         requested = self._read_sim_params(options.get("sim_params") or {})
-        schedules = self._read_schedules(options.get("schedule"))
+        schedules = self._read_schedules(options.get("schedule") or {})
         mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ConfigError(f"reset_mask is {mask}, allowed: {self.num_envs} booleans.")
-        chosen = np.flatnonzero(mask)
-        self._start(chosen, [None if one is None else int(one) for one in seed], requested)
-        for i in chosen:
-            self._schedules[i] = schedules[i]
+        seeds = {i: seed[i] for i in np.flatnonzero(mask).tolist()}
+        for i, own in seeds.items():
+            if own is not None or self.rngs[i] is None:
+                self.rngs[i] = seeding.np_random(own)[0]
+        for i, begun in self._begin(seeds, requested).items():
+            failed = isinstance(begun, BrokenEpisodeError)
+            self._elapsed[i], self._ends[:, i], self._schedules[i] = (
+                0,
+                (False, failed),
+                schedules[i],
+            )
+            self._broken.pop(i, None)
+            if failed:
+                self._broken[i] = str(begun)
+            self._note_sim_params(i, requested[i] if failed else begun)
         return self._result()
 
     def step(
@@ -131,36 +137,21 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             BadEnvironmentError: An environment returned something misshapen.
         """
         actions = self._check_actions(actions)
-        rewards = np.zeros(self.num_envs)
-        next_step = self.autoreset_mode is AutoresetMode.NEXT_STEP
-        # Without autoreset a finished environment stands still: same flags, reward 0.
-        terminated, truncated = np.zeros_like(self._ends) if next_step else self._ends.copy()
-        finished = np.asarray(self._ends.any(0))
-        restart = finished & next_step
-        if restart.any():
-            nothing = [{}] * self.num_envs
-            self._start(np.flatnonzero(restart), [None] * self.num_envs, nothing)
-        broken = {i: why for i, why in self._broken.items() if restart[i]}
-        active = np.flatnonzero(~finished)
+        rewards, active = np.zeros(self.num_envs), np.flatnonzero(~self._ends.any(0))
         for i in active.tolist():
             changed = self._schedules[i].get(int(self._elapsed[i]))
             if changed:
-                try:
-                    self._change(i, changed)
-                except BrokenEpisodeError as error:
-                    broken[i] = str(error)
                 self._note_sim_params(i, changed)
-        active = np.setdiff1d(active, list(broken))
+                self._change(i, changed)
         if active.size:
             self._elapsed[active] += 1
-            *stepped, failed = self._advance(active, actions)
-            rewards[active], terminated[active], truncated[active] = stepped
-            truncated[active] |= self._elapsed[active] >= (self.episode_length or np.inf)
-            broken |= failed
-        rewards[list(broken)], truncated[list(broken)] = np.nan, True
-        self._broken |= broken
-        self._ends = np.stack([terminated, truncated])
+            rewards[active], ends, broken = self._advance(active, actions)
+            ends[1] |= self._elapsed[active] >= (self.episode_length or np.inf)
+            self._ends[:, active] = ends
+            rewards[list(broken)], self._ends[1, list(broken)] = np.nan, True
+            self._broken |= broken
         obs, info = self._result()
+        terminated, truncated = self._ends.copy()
         return obs, rewards, terminated, truncated, info
 
     @property
@@ -177,20 +168,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             obs[list(self._broken)] = np.nan
         return obs, info | {"broken": dict(self._broken)}
 
-    def _start(
-        self, chosen: np.ndarray, seeds: Sequence[int | None], requested: Sequence[SimParams]
-    ) -> None:
-        self._elapsed[chosen] = 0
-        self._ends[:, chosen] = False
-        for i, begun in self._begin(chosen, seeds, requested).items():
-            self._broken.pop(i, None)
-            failed = isinstance(begun, BrokenEpisodeError)
-            if failed:
-                self._broken[i], self._ends[1, i] = str(begun), True
-            self._note_sim_params(i, requested[i] if failed else begun)
-            self._schedules[i] = {}
-
-    def _note_sim_params(self, i: int, values: SimParams) -> None:
+    def _note_sim_params(self, i: int, values: Mapping[str, float]) -> None:
         for name, value in values.items():
             self._sim_params.setdefault(name, np.full(self.num_envs, np.nan))[i] = value
 
@@ -206,52 +184,49 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                     f"sim_params {name} has shape {given.shape}, allowed: one value, or"
                     f" {self.num_envs}, one per environment."
                 )
-            for row, value in zip(rows, np.broadcast_to(given, self.num_envs), strict=True):
-                row[name] = value.item() if isinstance(value, np.generic) else value
+            for row, value in zip(
+                rows, np.broadcast_to(given, self.num_envs).tolist(), strict=True
+            ):
+                row[name] = value
         return [self._check_sim_params(row) for row in rows]
 
     def _read_schedules(self, value: Any) -> list[dict[int, SimParams]]:
         """Check the schedules: one for all environments, or a sequence of one for each."""
-        given = value or {}
-        each = [given] * self.num_envs if isinstance(given, Mapping) else given
-        sequence = isinstance(each, Sequence) and len(each) == self.num_envs
-        if not sequence or not all(isinstance(one, Mapping) for one in each):
+        each = [value] * self.num_envs if isinstance(value, Mapping) else value
+        if not (
+            isinstance(each, Sequence)
+            and len(each) == self.num_envs
+            and all(isinstance(one, Mapping) for one in each)
+            and all(type(step) is int and step >= 0 for one in each for step in one)
+            and all(isinstance(values, Mapping) for one in each for values in one.values())
+        ):
             raise ConfigError(
-                f"schedule is {value!r}, allowed: one mapping, or {self.num_envs} of them, one per"
-                " environment."
+                f"schedule is {value!r}, allowed: values by parameter name by steps, which are"
+                " whole numbers from 0, {100: {'mass_scale': 2.0}}, or a list of"
+                f" {self.num_envs} such mappings, one per environment."
             )
-        schedules: list[dict[int, SimParams]] = [{} for _ in each]
-        for checked, one in zip(schedules, each, strict=True):
-            for step, sim_params in one.items():
-                whole = isinstance(step, int) and not isinstance(step, bool) and step >= 0
-                if not whole or not isinstance(sim_params, Mapping):
-                    raise ConfigError(
-                        f"schedule has {step!r}: {sim_params!r}, allowed: whole numbers from 0, and"
-                        " values by parameter name, {100: {'mass_scale': 2.0}}."
-                    )
-                checked[step] = self._check_sim_params(dict(sim_params))
-        return schedules
+        check = self._check_sim_params
+        return [{step: check(dict(values)) for step, values in one.items()} for one in each]
 
     def _check_sim_params(self, values: dict[str, Any]) -> SimParams:
         return values
 
-    @abc.abstractmethod
     def _check_actions(self, actions: np.ndarray) -> np.ndarray:
-        """Refuse actions of a wrong shape."""
+        allowed = self.action_space.shape
+        if allowed is not None and np.shape(actions) != allowed:
+            raise ConfigError(
+                f"actions have shape {np.shape(actions)}, allowed: {allowed}, a row for each"
+                " environment."
+            )
+        return actions
 
     @abc.abstractmethod
-    def _begin(
-        self, chosen: np.ndarray, seeds: Sequence[int | None], requested: Sequence[SimParams]
-    ) -> dict[int, SimParams | BrokenEpisodeError]:
-        """Start episodes in the environments of the given indices.
-
-        Returns:
-            Their simulator parameters, or why an episode cannot begin.
-        """
+    def _begin(self, seeds: Mapping[int, int | None], requested: Sequence[SimParams]) -> Begun:
+        """Start episodes in the environments that have a seed or None, with their `rngs`."""
 
     @abc.abstractmethod
     def _change(self, i: int, changed: SimParams) -> None:
-        """Change some simulator parameters of environment `i` during an episode."""
+        """Change the physics of environment `i` before its next step; they are noted already."""
 
     @abc.abstractmethod
     def _advance(self, active: np.ndarray, actions: np.ndarray) -> Outcome:
@@ -272,7 +247,6 @@ class SequentialVectorEnv(HeadwayVectorEnv):
         env_fns: Make the environments.
         sim_params: Draws the parameters that `reset` is not told; None leaves that to the
             environments, which must then return them in `info["sim_params"]`.
-        autoreset_mode: What happens after the end of an episode.
         episode_length: Steps after which an episode is cut; None leaves it to the environments.
 
     Raises:
@@ -285,95 +259,56 @@ class SequentialVectorEnv(HeadwayVectorEnv):
         env_fns: Sequence[Callable[[], gymnasium.Env]],
         *,
         sim_params: SimParamSets | None = None,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         episode_length: int | None = None,
     ):
         if not env_fns:
             raise ConfigError("env_fns is empty, allowed: at least one.")
         self.envs: list[Any] = self._make_all(env_fns)
-        spaces = [self._spaces(env) for env in self.envs]
-        super().__init__(len(spaces), spaces[0], autoreset_mode, episode_length)
+        spaces = list(self._call("spaces", dict.fromkeys(range(len(env_fns)), ())).values())
+        super().__init__(len(spaces), spaces[0], episode_length)
         for own in spaces:
             self._check_spaces(own)
-        self._sets = sim_params
-        self._rngs = [seeding.np_random()[0] for _ in spaces]
+        self._sets, self._changes = sim_params, {}
         self._obs: list[Any] = [np.zeros(spaces[0][0].shape or ()) for _ in spaces]
 
     def _make_all(self, env_fns: Sequence[Callable[[], gymnasium.Env]]) -> list[Any]:
         return [make() for make in env_fns]
 
-    def _spaces(self, env: Any) -> tuple[gymnasium.Space, gymnasium.Space]:
-        return env.observation_space, env.action_space
-
     def _call(self, method: str, calls: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
-        """Call `reset(seed, options)`, `step(action)` or `change(values)` of some environments.
-
-        Returns:
-            What it returned, or a `BrokenEpisodeError`.
-        """
+        """Let some environments answer, as in `_answer`; a `BrokenEpisodeError` is an answer."""
         found: dict[int, Any] = {}
         for i, given in calls.items():
-            env = self.envs[i]
             try:
-                if method == "reset":
-                    found[i] = env.reset(seed=given[0], options=given[1])
-                    self._check_spaces(self._spaces(env))
-                elif method == "step":
-                    found[i] = env.step(*given)
-                else:
-                    found[i] = env.get_wrapper_attr("set_sim_params")(*given)
+                found[i] = _answer(self.envs[i], method, *given)
             except BrokenEpisodeError as error:
                 found[i] = error
         return found
 
-    def _check_actions(self, actions: np.ndarray) -> np.ndarray:
-        allowed = self.action_space.shape
-        if allowed is not None and np.shape(actions) != allowed:
-            raise ConfigError(
-                f"actions have shape {np.shape(actions)}, allowed: {allowed}, an action for each"
-                " environment."
-            )
-        return actions
-
-    def _begin(
-        self, chosen: np.ndarray, seeds: Sequence[int | None], requested: Sequence[SimParams]
-    ) -> dict[int, SimParams | BrokenEpisodeError]:
-        asked: dict[int, SimParams] = {}
-        for i in chosen.tolist():
-            asked[i] = requested[i]
-            if self._sets is not None:
-                if seeds[i] is not None:
-                    self._rngs[i] = seeding.np_random(seeds[i])[0]
-                asked[i] = self._sets.sample(self._rngs[i]) | requested[i]
-        calls = {i: (seeds[i], {"sim_params": asked[i]} if asked[i] else None) for i in asked}
-        begun: dict[int, SimParams | BrokenEpisodeError] = {}
-        for i, found in self._call("reset", calls).items():
-            if isinstance(found, BrokenEpisodeError):
-                begun[i] = found
-                continue
-            self._obs[i] = self._check_obs(found[0])
-            begun[i] = asked[i] | found[1].get("sim_params", {})
+    def _begin(self, seeds: Mapping[int, int | None], requested: Sequence[SimParams]) -> Begun:
+        asked = {i: requested[i] for i in seeds}
+        if self._sets is not None:
+            asked = {i: self._sets.sample(self.rngs[i]) | given for i, given in asked.items()}
+        options = {i: {"sim_params": given} if given else None for i, given in asked.items()}
+        begun = self._call("reset", {i: (seeds[i], options[i]) for i in seeds})
+        for i, found in begun.items():
+            if not isinstance(found, BrokenEpisodeError):
+                obs, sim_params, spaces = found
+                self._check_spaces(spaces)
+                self._obs[i], begun[i] = self._check_obs(obs), asked[i] | sim_params
         return begun
 
     def _change(self, i: int, changed: SimParams) -> None:
-        try:
-            found = self._call("change", {i: (changed,)})[i]
-        except AttributeError as error:
-            raise ConfigError(
-                "schedule was given, but the environment has no method set_sim_params(values); add"
-                " one, or leave the schedule out."
-            ) from error
-        if isinstance(found, BrokenEpisodeError):
-            raise found
+        self._changes[i] = changed
 
     def _advance(self, active: np.ndarray, actions: np.ndarray) -> Outcome:
-        found = self._call("step", {int(i): (actions[i],) for i in active})
+        calls = {i: (actions[i], self._changes.pop(i, None)) for i in active.tolist()}
+        found = self._call("step", calls)
         rewards, ends, broken = np.zeros(len(active)), np.zeros((2, len(active)), bool), {}
         for row, (i, result) in enumerate(found.items()):
             if isinstance(result, BrokenEpisodeError):
                 broken[i] = str(result)
                 continue
-            obs, reward, *ends[:, row] = result[:4]
+            obs, reward, *ends[:, row] = result
             self._obs[i] = self._check_obs(obs)
             try:
                 rewards[row] = float(reward)
@@ -382,9 +317,9 @@ class SequentialVectorEnv(HeadwayVectorEnv):
                     f"an environment returned the reward {reward!r}, allowed: a number; correct"
                     " the environment."
                 ) from None
-        return rewards, ends[0], ends[1], broken
+        return rewards, ends, broken
 
-    def _check_spaces(self, spaces: tuple[gymnasium.Space, gymnasium.Space]) -> None:
+    def _check_spaces(self, spaces: Spaces) -> None:
         allowed = self.single_observation_space, self.single_action_space
         if spaces != allowed:
             raise BadEnvironmentError(
@@ -409,6 +344,28 @@ class SequentialVectorEnv(HeadwayVectorEnv):
         """Close the environments."""
         for env in self.envs:
             env.close()
+
+
+def _answer(env: gymnasium.Env, method: str, *given: Any) -> Any:
+    """Call a method of an environment and return what matters of the answer.
+
+    `reset` gives observation, simulator parameters and spaces; `step`, maybe after a change of
+    simulator parameters, all but the infos.
+    """
+    if method == "spaces":
+        return env.observation_space, env.action_space
+    if method == "reset":
+        obs, info = env.reset(seed=given[0], options=given[1])
+        return obs, info.get("sim_params", {}), (env.observation_space, env.action_space)
+    action, changed = given
+    if changed:
+        if not env.has_wrapper_attr("set_sim_params"):
+            raise ConfigError(
+                "schedule was given, but the environment has no method set_sim_params(values); add"
+                " one, or leave the schedule out."
+            )
+        env.get_wrapper_attr("set_sim_params")(changed)
+    return env.step(action)[:4]
 
 
 class ProcessVectorEnv(SequentialVectorEnv):
@@ -443,13 +400,9 @@ class ProcessVectorEnv(SequentialVectorEnv):
         if not step_timeout_s > 0:
             raise ConfigError(f"step_timeout_s is {step_timeout_s}, allowed: more than 0.")
         self._env_fns, self._timeout_s = list(env_fns), step_timeout_s
-        self._living: dict[int, AsyncVectorEnv] = {}
+        self._living: dict[int, Any] = {}
         self._end = weakref.finalize(self, _kill, self._living)
-        try:
-            super().__init__(env_fns, **kwargs)
-        except BaseException:
-            self._end()
-            raise
+        super().__init__(env_fns, **kwargs)
 
     def _make_all(self, env_fns: Sequence[Callable[[], gymnasium.Env]]) -> list[Any]:
         with ThreadPoolExecutor(len(env_fns)) as pool:  # each waits for its process to begin
@@ -463,12 +416,10 @@ class ProcessVectorEnv(SequentialVectorEnv):
                 # In a group of its own Ctrl-C reaches only the parent, and what the environment
                 # starts can be killed with it.
                 os.setpgrp()
-            return _Raising(make())
+            return _Answering(make())
 
         try:
-            env = AsyncVectorEnv(
-                [made], context="spawn", daemon=False, autoreset_mode=AutoresetMode.DISABLED
-            )
+            env = AsyncVectorEnv([made], context="spawn", daemon=False, shared_memory=False)
         except (EOFError, ConnectionError) as error:
             raise BadEnvironmentError(
                 "an environment's process ended while it was begun; see to it that it can be made"
@@ -477,52 +428,30 @@ class ProcessVectorEnv(SequentialVectorEnv):
         self._living[i] = env
         return env
 
-    @property
-    def pids(self) -> list[int]:
-        """Numbers of the processes, each the first of a group."""
-        return [env.processes[0].pid for env in self.envs]
-
-    def _spaces(self, env: Any) -> tuple[gymnasium.Space, gymnasium.Space]:
-        return env.single_observation_space, env.single_action_space
-
     def _call(self, method: str, calls: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
         ends = time.monotonic() + self._timeout_s
         for i, given in calls.items():
-            env = self.envs[i]
             with contextlib.suppress(OSError):  # its process is gone; waiting will tell
-                if method == "reset":
-                    env.reset_async(*given)
-                elif method == "step":
-                    env.step_async(given[0][None])
-                else:
-                    env.call_async("set_sim_params", *given)
-        waiting = {"reset": "reset_wait", "step": "step_wait", "change": "call_wait"}[method]
+                self.envs[i].call_async("answer", method, *given)
         found: dict[int, Any] = {}
-        failed: Exception | None = None
         for i in calls:
             env = self.envs[i]
             try:
-                with warnings.catch_warnings(action="ignore"):  # Gymnasium's, of what it raises
-                    found[i] = getattr(env, waiting)(timeout=max(0.0, ends - time.monotonic()))
+                (found[i],) = env.call_wait(timeout=max(0.0, ends - time.monotonic()))
+                continue
             except multiprocessing.TimeoutError:
                 why = f"did not answer to {method} within {self._timeout_s:g} s"
-                found[i] = BrokenEpisodeError(why)
-            except (EOFError, OSError):
+            except (EOFError, OSError, NoAsyncCallError):
                 env.processes[0].join()
                 code = env.processes[0].exitcode or 0
                 how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"over ({code})"
-                found[i] = BrokenEpisodeError(f"had its process {how} during {method}")
-            except BrokenEpisodeError as error:
-                found[i] = error
-            except Exception as error:  # only once all have answered
-                failed = error
-            else:
-                found[i] = _single(found[i]) if method != "change" else None
-                continue
-            _kill({i: self._living.pop(i)})  # Gymnasium's workers end with the first error
+                why = f"had its process {how} during {method}"
+            found[i] = BrokenEpisodeError(why)
+            _kill({i: self._living.pop(i)})
             self.envs[i] = self._make_one(i)
-        if failed is not None:
-            raise failed
+        for answer in found.values():  # once all have answered
+            if isinstance(answer, Exception) and not isinstance(answer, BrokenEpisodeError):
+                raise answer
         return found
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -530,50 +459,28 @@ class ProcessVectorEnv(SequentialVectorEnv):
         self._end()
 
 
-class _Raising(gymnasium.Wrapper):
-    """Raises only what can be sent to the parent: one of Headway's errors, with a text."""
+class _Answering(gymnasium.Wrapper):
+    """Answers in the process. Gymnasium's worker would end with an error, so that is an answer."""
 
-    def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
-        with _headway_errors():
-            return self.env.reset(**given)
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        with _headway_errors():
-            return self.env.step(action)
-
-
-@contextlib.contextmanager
-def _headway_errors():
-    try:
-        yield
-    except HeadwayError as error:
-        raise type(error)(str(error)) from error
-    except Exception as error:
-        raise BadEnvironmentError(f"raised {type(error).__name__}: {error}") from error
+    def answer(self, method: str, *given: Any) -> Any:
+        try:
+            return _answer(self.env, method, *given)
+        except HeadwayError as error:
+            return type(error)(str(error))
+        except Exception as error:  # of a class that the parent may not know
+            reason = " ".join(str(error).split())
+            return BadEnvironmentError(f"raised {type(error).__name__}: {reason}")
 
 
-def _single(batch: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Take a batch of one apart: what an environment itself returned."""
-    *arrays, info = batch
-    sim_params = {
-        name: values[0]
-        for name, values in info.get("sim_params", {}).items()
-        if not name.startswith("_")  # Gymnasium's masks
-    }
-    return *(array[0] for array in arrays), {"sim_params": sim_params}
-
-
-def _kill(envs: dict[int, AsyncVectorEnv]) -> None:
+def _kill(envs: dict[int, Any]) -> None:
     """End processes with all that they started."""
     for env in envs.values():
-        for process in env.processes:
-            if process.pid is not None:
-                with contextlib.suppress(ProcessLookupError, PermissionError):
-                    os.killpg(process.pid, signal.SIGKILL)
-                process.kill()
-            process.join()
-        for pipe in env.parent_pipes:
-            if pipe is not None:
-                pipe.close()
+        (process,), (pipe,) = env.processes, env.parent_pipes
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.kill()
+        process.join()
+        if pipe is not None:  # Gymnasium gave it up
+            pipe.close()
         env.closed = True
     envs.clear()

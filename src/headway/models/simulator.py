@@ -18,8 +18,7 @@ from headway.models.base import Dynamics, Keys, Model, Transition, over_rows
 from headway.task import Task, env_action
 
 if TYPE_CHECKING:
-    from headway.envs.built_in import ClassicVectorEnv
-    from headway.envs.futures import RobotFutures
+    from headway.envs.built_in import ClassicVectorEnv, RobotVectorEnv
 
 
 class Physics(NamedTuple):
@@ -90,7 +89,8 @@ class ClassicDynamics(Dynamics):
 class RobotSimulator(Model):
     """MuJoCo, which JAX cannot trace; it rolls out whole candidates from where its robots are."""
 
-    futures: "RobotFutures" = eqx.field(static=True)
+    vector: "RobotVectorEnv" = eqx.field(static=True)
+    """The environments that are acted in."""
     task: Task
     traceable = False
 
@@ -118,8 +118,8 @@ class RobotSimulator(Model):
             candidates: Action sequences in [-1, 1].
         """
         actions = env_action(self.task, np.asarray(candidates)).astype(np.float64)
-        world, found = self.futures.vector.world, []
+        found = []
         for i, sequences in enumerate(actions):
-            before, after = self.futures.roll_out(i, sequences)
-            found.append(world.reward(before, sequences, after).sum(-1))
+            before, after = self.vector.roll_out(i, sequences)
+            found.append(self.vector.world.reward(before, sequences, after).sum(-1))
         return np.stack(found).astype(np.float32)

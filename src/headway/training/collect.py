@@ -60,9 +60,7 @@ class Environments:
         Raises:
             BadEnvironmentError: The environment's spaces do not fit its Task.
         """
-        from gymnasium.vector import AutoresetMode  # a controller is loaded without a simulator
-
-        from headway import envs
+        from headway import envs  # a controller is loaded without a simulator
 
         collection, options = config.collection, env_options(config)
         task, sim_params = task_of(config), sim_param_sets(config)
@@ -71,7 +69,6 @@ class Environments:
             collection.num_episodes,
             sim_params=sim_params,
             options=options,
-            autoreset_mode=AutoresetMode.DISABLED,
             episode_length=episode_length(config),
             step_timeout_s=collection.step_timeout_s if collection.env_processes else None,
         )

@@ -314,14 +314,13 @@ class SimulatorTrainer(Trainer):
                 " its simulator; use `headway evaluate`."
             )
         from headway.envs.built_in import ClassicVectorEnv, RobotVectorEnv
-        from headway.envs.futures import RobotFutures
         from headway.models.simulator import ClassicSimulator, RobotSimulator
 
         vector = self.environments.vector
         if isinstance(vector, ClassicVectorEnv):
             return ClassicSimulator(vector, self.task)
         if isinstance(vector, RobotVectorEnv):
-            return RobotSimulator(RobotFutures(vector), self.task)
+            return RobotSimulator(vector, self.task)
         raise ConfigError(
             f"{self.config.env} has no simulator to plan with, allowed: the built-in"
             " environments; choose another method than true-dynamics."

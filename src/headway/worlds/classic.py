@@ -11,9 +11,9 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from headway.envs.world import World
 from headway.sim_params import SimParamSets
 from headway.task import Action, Ends, EnvSpec, Obs, Reward, Task
+from headway.worlds.base import World
 
 Physics = Mapping[str, Any]
 """Simulator parameters, each a number or an array with the axes of the states."""
@@ -47,10 +47,6 @@ class ClassicWorld(World):
         """Return where a step ended the episode."""
         return np.zeros(next_state.shape[:-1], bool)
 
-    @abc.abstractmethod
-    def draw_frame(self, state: np.ndarray, action: np.ndarray, sim_params: Physics) -> np.ndarray:
-        """Draw a state and the action that led to it."""
-
 
 class CartPoleSwingUpTask(Task):
     """Swing a pole up by pushing the cart it hangs from, and keep it up.
@@ -63,10 +59,8 @@ class CartPoleSwingUpTask(Task):
         Supplement A.1; reward and equations of gym-cartpole-swingup.
     """
 
-    obs_size: ClassVar[int] = 5
-    action_size: ClassVar[int] = 1
-    action_low: ClassVar[tuple[float, ...]] = (-1.0,)
-    action_high: ClassVar[tuple[float, ...]] = (1.0,)
+    obs_size, action_size = 5, 1
+    action_low, action_high = (-1.0,), (1.0,)
 
     terminate_off_track: bool = False
     """End the episode when the cart is more than 2.4 m from the middle."""
@@ -122,10 +116,7 @@ class CartPoleSwingUp(ClassicWorld):
     time_step = 0.01
     gravity, force, friction = 9.82, 10.0, 0.1
     cart_mass, pole_mass, pole_length = 0.5, 0.5, 0.6
-
-    def obs_bounds(self) -> np.ndarray:
-        """Bounds of the pole's direction."""
-        return np.array([np.inf, np.inf, 1, 1, np.inf])
+    obs_bounds = (np.inf, np.inf, 1.0, 1.0, np.inf)
 
     def initial_state(self, rng: np.random.Generator) -> np.ndarray:
         """Nearly at rest, hanging down."""
@@ -161,14 +152,6 @@ class CartPoleSwingUp(ClassicWorld):
         off_track = np.abs(self.observe(next_state)[..., 0]) > np.float32(TRACK_LIMIT)
         return off_track & self.task.terminate_off_track
 
-    def draw_frame(self, state: np.ndarray, action: np.ndarray, sim_params: Physics) -> np.ndarray:
-        """Draw cart, pole and the pushing force."""
-        from headway.envs import rendering
-
-        return rendering.cart_pole(
-            state[0], state[2], self.pole_length, float(action[0]), sim_params["mass_scale"]
-        )
-
 
 class PendulumTask(Task):
     """Swing a pendulum up with a torque too weak to lift it directly, and keep it up.
@@ -179,10 +162,8 @@ class PendulumTask(Task):
         Supplement A.1; reward of OpenAI Gym's Pendulum.
     """
 
-    obs_size: ClassVar[int] = 3
-    action_size: ClassVar[int] = 1
-    action_low: ClassVar[tuple[float, ...]] = (-2.0,)
-    action_high: ClassVar[tuple[float, ...]] = (2.0,)
+    obs_size, action_size = 3, 1
+    action_low, action_high = (-2.0,), (2.0,)
 
     def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """Minus the cost of angle, speed and torque before the step."""
@@ -240,10 +221,7 @@ class Pendulum(ClassicWorld):
     state_size = 2
     time_step = 0.05
     gravity, max_speed = 10.0, 8.0
-
-    def obs_bounds(self) -> np.ndarray:
-        """Bounds of direction and clipped speed."""
-        return np.array([1.0, 1.0, self.max_speed])
+    obs_bounds = (1.0, 1.0, max_speed)
 
     def initial_state(self, rng: np.random.Generator) -> np.ndarray:
         """Any angle, and a speed within ±1 rad/s."""
@@ -273,8 +251,5 @@ class Pendulum(ClassicWorld):
         torque = action[..., 0]
         return -(np.square(wrapped) + 0.1 * np.square(spin) + 0.001 * np.square(torque))
 
-    def draw_frame(self, state: np.ndarray, action: np.ndarray, sim_params: Physics) -> np.ndarray:
-        """Draw the rod at its true relative length, and the torque."""
-        from headway.envs import rendering
 
-        return rendering.pendulum(state[0], sim_params["length"], float(action[0]) / 2.0)
+WORLDS = (Pendulum, CartPoleSwingUp)

@@ -33,6 +33,8 @@ class World(abc.ABC):
     obs_dtype: ClassVar[type[np.floating]]
     choices: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     """Allowed values of the parameters that are no positive numbers."""
+    obs_bounds: ClassVar[float | tuple[float, ...]] = math.inf
+    """Largest absolute values of an observation."""
     time_step: float
     """Seconds between two observations."""
 
@@ -45,10 +47,6 @@ class World(abc.ABC):
         for group in self.sim_params.group_names:
             for values in self.sim_params.group(group):
                 self.check(values)
-
-    def obs_bounds(self) -> np.ndarray:
-        """Largest absolute values of an observation [obs]."""
-        return np.full(self.task.obs_size, np.inf)
 
     def check(self, values: Mapping[str, Any]) -> SimParams:
         """Return simulator parameters as floats.
@@ -73,27 +71,3 @@ class World(abc.ABC):
                 )
             checked[name] = number
         return checked
-
-    def draw(self, rng: np.random.Generator, requested: SimParams) -> SimParams:
-        """Draw what was not requested from the training values.
-
-        The same random numbers are used up whatever was requested.
-        """
-        return {**self.spec.default_sim_params, **self.sim_params.sample(rng), **requested}
-
-    def clip(self, actions: Any, num_envs: int) -> np.ndarray:
-        """Return actions [env, action] as float64 within bounds.
-
-        Raises:
-            ConfigError: The shape is wrong or a number is not finite.
-        """
-        actions = np.asarray(actions, np.float64)
-        allowed = (num_envs, self.task.action_size)
-        if actions.shape != allowed or not np.isfinite(actions).all():
-            raise ConfigError(
-                f"{self.spec.name} was given the actions {actions.tolist()} of shape"
-                f" {actions.shape}, allowed: finite numbers of shape {allowed}, a row for each"
-                " environment."
-            )
-        low, high = self.task.action_low, self.task.action_high
-        return np.clip(actions, np.asarray(low, np.float32), np.asarray(high, np.float32))

@@ -8,20 +8,18 @@ files that Gymnasium ships; MuJoCo is imported when the first one is loaded.
 """
 
 import abc
-import copy
 import functools
-import importlib.util
 from collections.abc import Mapping
-from pathlib import Path
+from importlib import resources
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from headway.envs.world import World
 from headway.sim_params import SimParamSets
 from headway.task import Action, EnvSpec, Obs, Reward, Task
+from headway.worlds.base import World
 
 GREY = (0.42, 0.44, 0.47, 1.0)
 """Colour of a crippled leg."""
@@ -36,34 +34,36 @@ class RobotState(NamedTuple):
     """Average forward velocity over the control step that led here (m/s); 0 at reset."""
 
 
-class Camera(NamedTuple):
-    """A camera that follows the robot from the side, looking at a height (m)."""
-
-    distance: float
-    elevation: float
-    height: float
-
-
 class Robot(World):
     """A robot that is paid for moving forward."""
 
     obs_dtype = np.float64
     xml: ClassVar[str]
     frame_skip: ClassVar[int]
-    camera: ClassVar[Camera]
+    camera: ClassVar[tuple[float, float, float]]
+    """Distance (m), elevation (degrees) and height (m) of the view, which follows from the side."""
+    start_noise: ClassVar[tuple[str, str, float]]
+    """Noise of the first positions and velocities, `uniform` or `normal`, and its size."""
+    alive, effort = 0.0, 0.0
+    """Reward of every step, and price of the sum of squared actions."""
 
     def __init__(self, sim_params: SimParamSets | None = None, **options: bool):
         super().__init__(sim_params, **options)
         self.nominal = load_model(self.xml)
         self.time_step = self.frame_skip * self.nominal.opt.timestep
 
-    def new_model(self) -> Any:
-        """Return a copy of the unchanged robot's `MjModel`."""
-        return copy.copy(self.nominal)
-
-    @abc.abstractmethod
-    def initial_state(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Draw the positions and velocities that an episode starts with."""
+    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
+        """Draw positions and velocities that an episode starts with, at no average velocity."""
+        positions, velocities, size = self.start_noise
+        draw = {
+            "uniform": lambda count: rng.uniform(-size, size, count),
+            "normal": lambda count: rng.normal(0.0, size, count),
+        }
+        qpos = self.nominal.qpos0 + draw[positions](self.nominal.nq)
+        if self.nominal.nq > self.nominal.nv:  # has a quaternion, which MuJoCo 2.0 normalised
+            qpos[3:7] /= np.linalg.norm(qpos[3:7])
+        qvel = draw[velocities](self.nominal.nv)
+        return np.concatenate([qpos, qvel, np.zeros(self.nominal.nv + 1)])
 
     def set_physics(self, model: Any, sim_params: Mapping[str, float]) -> None:
         """Scale the nominal masses and damping.
@@ -87,27 +87,15 @@ class Robot(World):
     def observe(self, state: RobotState) -> np.ndarray:
         """Return the observation [..., obs] of a state."""
 
-    @abc.abstractmethod
     def reward(self, before: RobotState, action: np.ndarray, after: RobotState) -> np.ndarray:
-        """Return the reward [...] of a step."""
+        """Return the reward [...] of a step: forward velocity, being alive, and effort."""
+        del before
+        return after.velocity + self.alive - self.effort * np.square(action).sum(-1)
 
     def after_step(self, before: RobotState, qpos: np.ndarray, qvel: np.ndarray) -> RobotState:
         """Assemble the state that a step led to."""
         velocity = (qpos[..., 0] - before.qpos[..., 0]) / self.time_step
         return RobotState(qpos, qvel, velocity)
-
-    def warning(self, data: Any) -> str:
-        """Return MuJoCo's complaint about an `MjData`: huge numbers or full buffers; or nothing.
-
-        It would quietly start over from the nominal state.
-        """
-        counts = data.warning.number
-        if not counts.any():
-            return ""
-        import mujoco
-
-        name = mujoco.mjtWarning(int(np.argmax(counts))).name.removeprefix("mjWARN_")
-        return f"the simulation of {self.spec.name} diverged ({name})"
 
 
 def _mass_sets(train: tuple[float, ...], low: tuple[float, ...], high: tuple[float, ...]):
@@ -138,9 +126,8 @@ class HopperTask(Task):
         Supplement A.1; released `hopper_env.py`.
     """
 
-    action_size: ClassVar[int] = 3
-    action_low: ClassVar[tuple[float, ...]] = (-1.0,) * 3
-    action_high: ClassVar[tuple[float, ...]] = (1.0,) * 3
+    action_size = 3
+    action_low, action_high = (-1.0,) * 3, (1.0,) * 3
 
     scale_inertia: bool = False
     """Apply the mass scale to the rotational inertia too."""
@@ -168,18 +155,12 @@ class HopperTask(Task):
         return obs[..., :11]
 
     def target(self, obs: Obs, next_obs: Obs) -> Obs:
-        """Differences, and the average velocity itself."""
-        delta = next_obs - obs
-        if not self.observe_average_velocity:
-            return delta
-        return delta.at[..., 11].set(next_obs[..., 11])
+        """Differences, and the average velocity itself, if it is observed."""
+        return (next_obs - obs).at[..., 11:].set(next_obs[..., 11:])
 
     def postprocess(self, obs: Obs, delta: Obs) -> Obs:
         """Undo `target`."""
-        next_obs = obs + delta
-        if not self.observe_average_velocity:
-            return next_obs
-        return next_obs.at[..., 11].set(delta[..., 11])
+        return (obs + delta).at[..., 11:].set(delta[..., 11:])
 
 
 _QUATERNION = tuple(f"torso quaternion {part}" for part in "wxyz")
@@ -232,23 +213,15 @@ class Hopper(Robot):
     """
 
     spec, xml, frame_skip = HOPPER, "hopper.xml", 4
-    camera = Camera(distance=3.1, elevation=-8.0, height=0.75)
-
-    def initial_state(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Uniform noise of ±0.005 on positions and velocities."""
-        qpos = self.nominal.qpos0 + rng.uniform(-0.005, 0.005, self.nominal.nq)
-        return qpos, rng.uniform(-0.005, 0.005, self.nominal.nv)
+    camera = (3.1, -8.0, 0.75)
+    start_noise = ("uniform", "uniform", 0.005)
+    alive, effort = 1.0, 1e-3
 
     def observe(self, state: RobotState) -> np.ndarray:
         """Return positions but x, clipped velocities, and the average forward velocity."""
         velocity = state.velocity[..., None]
         parts = [state.qpos[..., 1:], np.clip(state.qvel, -10.0, 10.0), velocity]
         return np.concatenate(parts, axis=-1)[..., : self.task.obs_size]
-
-    def reward(self, before: RobotState, action: np.ndarray, after: RobotState) -> np.ndarray:
-        """Forward velocity, 1 for being alive, and a small price of effort."""
-        del before
-        return after.velocity + 1.0 - 1e-3 * np.square(action).sum(-1)
 
 
 class SlimHumanoidTask(Task):
@@ -260,10 +233,8 @@ class SlimHumanoidTask(Task):
         Supplement A.1; released `slim_humanoid_env.py`.
     """
 
-    obs_size: ClassVar[int] = 45
-    action_size: ClassVar[int] = 17
-    action_low: ClassVar[tuple[float, ...]] = (-0.4,) * 17
-    action_high: ClassVar[tuple[float, ...]] = (0.4,) * 17
+    obs_size, action_size = 45, 17
+    action_low, action_high = (-0.4,) * 17, (0.4,) * 17
 
     scale_inertia: bool = False
     """Apply the mass scale to the rotational inertia too."""
@@ -321,12 +292,8 @@ class SlimHumanoid(Robot):
     """
 
     spec, xml, frame_skip = SLIM_HUMANOID, "humanoid.xml", 5
-    camera = Camera(distance=3.6, elevation=-8.0, height=0.9)
-
-    def initial_state(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Uniform noise of ±0.01 on positions and velocities; the quaternion normalised."""
-        qpos = self.nominal.qpos0 + rng.uniform(-0.01, 0.01, self.nominal.nq)
-        return _with_unit_quaternion(qpos), rng.uniform(-0.01, 0.01, self.nominal.nv)
+    camera = (3.6, -8.0, 0.9)
+    start_noise = ("uniform", "uniform", 0.01)
 
     def observe(self, state: RobotState) -> np.ndarray:
         """Return positions but x and y, and velocities."""
@@ -352,10 +319,8 @@ class HalfCheetahTask(Task):
         Supplement A.1; released `half_cheetah_env.py`.
     """
 
-    obs_size: ClassVar[int] = 18
-    action_size: ClassVar[int] = 6
-    action_low: ClassVar[tuple[float, ...]] = (-1.0,) * 6
-    action_high: ClassVar[tuple[float, ...]] = (1.0,) * 6
+    obs_size, action_size = 18, 6
+    action_low, action_high = (-1.0,) * 6, (1.0,) * 6
 
     scale_inertia: bool = False
     """Apply the mass scale to the rotational inertia too."""
@@ -423,21 +388,13 @@ class HalfCheetah(Robot):
     """
 
     spec, xml, frame_skip = HALF_CHEETAH, "half_cheetah.xml", 5
-    camera = Camera(distance=2.9, elevation=-12.0, height=0.45)
-
-    def initial_state(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Normal noise with standard deviation 0.001 on positions and velocities."""
-        qpos = self.nominal.qpos0 + rng.normal(0.0, 0.001, self.nominal.nq)
-        return qpos, rng.normal(0.0, 0.001, self.nominal.nv)
+    camera = (2.9, -12.0, 0.45)
+    start_noise = ("normal", "normal", 0.001)
+    effort = 0.1
 
     def observe(self, state: RobotState) -> np.ndarray:
         """Return the average forward velocity, positions but x, and velocities."""
         return np.concatenate([state.velocity[..., None], state.qpos[..., 1:], state.qvel], -1)
-
-    def reward(self, before: RobotState, action: np.ndarray, after: RobotState) -> np.ndarray:
-        """Forward velocity and the price of effort."""
-        del before
-        return after.velocity - 0.1 * np.square(action).sum(-1)
 
 
 class CrippledAntTask(Task):
@@ -452,10 +409,8 @@ class CrippledAntTask(Task):
         Supplement A.1; released `ant_cripple_env.py`.
     """
 
-    obs_size: ClassVar[int] = 41
-    action_size: ClassVar[int] = 8
-    action_low: ClassVar[tuple[float, ...]] = (-1.0,) * 8
-    action_high: ClassVar[tuple[float, ...]] = (1.0,) * 8
+    obs_size, action_size = 41, 8
+    action_low, action_high = (-1.0,) * 8, (1.0,) * 8
 
     shrink_leg: bool = False
     """Make the crippled leg half as long and thick, too."""
@@ -506,7 +461,9 @@ class CrippledAnt(Robot):
     """
 
     spec, xml, frame_skip = CRIPPLED_ANT, "ant.xml", 5
-    camera = Camera(distance=3.4, elevation=-40.0, height=0.3)
+    camera = (3.4, -40.0, 0.3)
+    start_noise = ("uniform", "normal", 0.1)
+    alive = 0.05
     choices: ClassVar[Mapping[str, tuple[float, ...]]] = {"crippled_leg": (-1, 0, 1, 2, 3)}
     leg_geoms = (
         ("left_leg_geom", "left_ankle_geom"),
@@ -517,12 +474,6 @@ class CrippledAnt(Robot):
     """Upper and lower part of each leg."""
     # Leg i obeys the i-th of these pairs of actuators; the last row serves leg -1: all obey.
     obeying = np.vstack([np.repeat(np.arange(4) != pair, 2) for pair in (1, 2, 3, 0, -1)])
-
-    def initial_state(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Noise U(±0.1) on positions, 0.1 N(0, 1) on velocities; the quaternion normalised."""
-        qpos = self.nominal.qpos0 + rng.uniform(-0.1, 0.1, self.nominal.nq)
-        qvel = 0.1 * rng.standard_normal(self.nominal.nv)
-        return _with_unit_quaternion(qpos), qvel
 
     def set_physics(self, model: Any, sim_params: Mapping[str, float]) -> None:
         """Colour the crippled leg and, if asked for, halve its capsules."""
@@ -552,16 +503,8 @@ class CrippledAnt(Robot):
         rotation = np.stack([entry for row in rows for entry in row], axis=-1)
         return np.concatenate([state.qpos, state.qvel, rotation, state.qpos[..., :3]], axis=-1)
 
-    def reward(self, before: RobotState, action: np.ndarray, after: RobotState) -> np.ndarray:
-        """Forward velocity and a constant; effort is free."""
-        del before, action
-        return after.velocity + 0.05
 
-
-def _with_unit_quaternion(qpos: np.ndarray) -> np.ndarray:
-    """Normalise the free joint's quaternion, as MuJoCo 2.0 did in place."""
-    qpos[3:7] /= np.linalg.norm(qpos[3:7])
-    return qpos
+WORLDS = (Hopper, SlimHumanoid, HalfCheetah, CrippledAnt)
 
 
 @functools.cache
@@ -573,12 +516,9 @@ def load_model(xml: str) -> Any:
     """
     import mujoco
 
-    from headway.envs import rendering
+    from headway.worlds import rendering
 
-    found = importlib.util.find_spec("gymnasium")
-    assert found is not None
-    assert found.origin is not None
-    path = Path(found.origin).parent / "envs" / "mujoco" / "assets" / xml
+    path = resources.files("gymnasium") / "envs" / "mujoco" / "assets" / xml
     spec = mujoco.MjSpec.from_file(str(path))
     total_mass = spec.compiler.settotalmass
     spec.compiler.settotalmass = -1

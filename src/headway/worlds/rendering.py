@@ -7,13 +7,14 @@ import ctypes.util
 import importlib
 import os
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
 
-from headway.envs.locomotion import Camera
 from headway.errors import BadEnvironmentError
+from headway.worlds.classic import CartPoleSwingUp, PendulumTask
 
 WIDTH, HEIGHT = 640, 480
 SCALE = 3  # Pillow's lines are jagged, so they are drawn larger and averaged
@@ -64,18 +65,11 @@ class _Canvas:
         return np.asarray(small, np.uint8).copy()
 
 
-def cart_pole(x: float, angle: float, length: float, push: float, mass_scale: float) -> np.ndarray:
-    """Draw a cart with its pole; heavier ones are drawn thicker.
-
-    Args:
-        x: Position of the cart (m).
-        angle: Of the pole, 0 upright, positive towards positive x (rad).
-        length: Of the pole (m).
-        push: Force in units of its limit, drawn as an arrow.
-        mass_scale: Scale of both masses.
-    """
-    canvas, track = _Canvas(), -0.25
-    bulk = float(np.clip(mass_scale, 0.05, 4.0)) ** (1 / 3)
+def cart_pole(state: np.ndarray, push: float, sim_params: Mapping[str, float]) -> np.ndarray:
+    """Draw a cart with its pole and the force on it; heavier ones are drawn thicker."""
+    canvas, track, length = _Canvas(), -0.25, CartPoleSwingUp.pole_length
+    x, _, angle, _ = state
+    bulk = float(np.clip(sim_params["mass_scale"], 0.05, 4.0)) ** (1 / 3)
     for mark in np.arange(-2.0, 2.1, 0.5):
         canvas.line((mark, track - 0.03), (mark, track - 0.07), 0.012, GRID)
     canvas.line((-2.4, track), (2.4, track), 0.03, GRID)
@@ -94,15 +88,10 @@ def cart_pole(x: float, angle: float, length: float, push: float, mass_scale: fl
     return canvas.frame()
 
 
-def pendulum(angle: float, length: float, torque: float) -> np.ndarray:
-    """Draw a rod that turns around the middle, and an arc for the torque.
-
-    Args:
-        angle: 0 upright, positive counter-clockwise (rad).
-        length: Of the rod (m).
-        torque: In units of its limit.
-    """
+def pendulum(state: np.ndarray, torque: float, sim_params: Mapping[str, float]) -> np.ndarray:
+    """Draw a rod of its true length that turns around the middle, and an arc for the torque."""
     canvas, origin, radius = _Canvas(), (0.0, 0.0), 0.26
+    angle, length, torque = state[0], sim_params["length"], torque / PendulumTask.action_high[0]
     for distance in (0.5, 1.0, 1.5):
         canvas.disc(origin, distance, GRID, outline=SCALE)
     canvas.line((0.0, 1.6), (0.0, 1.85), 0.012, GRID)
@@ -117,6 +106,10 @@ def pendulum(angle: float, length: float, torque: float) -> np.ndarray:
         along = np.sign(torque) * np.array([-radial[1], radial[0]])
         canvas.arrow_head((radius - 0.015) * radial, along)
     return canvas.frame()
+
+
+DRAWINGS = {"cartpole-swingup": cart_pole, "pendulum": pendulum}
+"""Drawings of a state, the action that led to it, and the physics, by the world's name."""
 
 
 def restyle(spec: Any) -> None:
@@ -157,11 +150,15 @@ class RobotRenderer:
     default to one that needs a screen; this one chooses when the first frame is asked for:
     the library that `MUJOCO_GL` names, else EGL if installed, else OSMesa.
 
+    Args:
+        model: An `MjModel`.
+        camera: Its distance (m), its elevation (degrees), and the height that it looks at (m).
+
     Raises:
         BadEnvironmentError: No OpenGL library for drawing without a screen was found.
     """
 
-    def __init__(self, model: Any, camera: Camera):
+    def __init__(self, model: Any, camera: tuple[float, float, float]):
         import mujoco
 
         model.vis.global_.offwidth, model.vis.global_.offheight = WIDTH, HEIGHT
@@ -177,12 +174,8 @@ class RobotRenderer:
             raise _no_opengl(f"{library} failed ({reason})") from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr)
         self._scene = mujoco.MjvScene(model, maxgeom=1000)
-        self._options, self._view, self._height = (
-            mujoco.MjvOption(),
-            mujoco.MjvCamera(),
-            camera.height,
-        )
-        self._view.distance, self._view.elevation = camera.distance, camera.elevation
+        self._options, self._view = mujoco.MjvOption(), mujoco.MjvCamera()
+        self._view.distance, self._view.elevation, self._height = camera
         self._view.azimuth = 90.0
 
     def frame(self, model: Any, data: Any) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""The paper's six worlds: Task, spec and laws of each, importable without a simulator."""
