@@ -105,12 +105,8 @@ class SimParamSets:
         return self.train if name == "train" else self.unseen[name]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain dictionaries and lists, ready for JSON."""
-        train, *unseen = (
-            {key: list(column) for key, column in self._values(name).items()}
-            for name in self.group_names
-        )
-        return {"train": train, "unseen": dict(zip(self.unseen, unseen, strict=True))}
+        """Return plain dictionaries and tuples, ready for JSON."""
+        return dataclasses.asdict(self)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "SimParamSets":

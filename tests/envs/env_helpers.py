@@ -43,3 +43,13 @@ def distinct_physics(name: str, number: int) -> dict[str, np.ndarray]:
     """Different physics for each of some environments."""
     rows = [all_physics(name)[i % len(all_physics(name))] for i in range(number)]
     return {key: np.array([row[key] for row in rows]) for key in rows[0]}
+
+
+def assert_same(left, right):
+    """What two vector environments returned is the same, to the bit."""
+    for a, b in zip(left[:-1], right[:-1], strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+    assert left[-1].keys() == right[-1].keys() == {"sim_params"}
+    for name, values in left[-1]["sim_params"].items():
+        np.testing.assert_array_equal(values, right[-1]["sim_params"][name])

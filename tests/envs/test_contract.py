@@ -50,15 +50,6 @@ def test_spaces_and_names(name, env):
     assert env.spec.max_episode_steps == spec.episode_length
 
 
-def test_seed_repeats_everything(env, name):
-    actions = actions_of(name, "random", 20)
-    first, _, rewards = record(env, actions, seed=5)
-    again, _, same = record(env, actions, seed=5)
-    np.testing.assert_array_equal(first, again)
-    np.testing.assert_array_equal(rewards, same)
-    assert not np.array_equal(first, record(env, actions, seed=6)[0])
-
-
 def test_sim_params_are_drawn_from_the_training_values(env, name):
     allowed = env_spec(name).sim_params.group("train")
     drawn = [env.reset(seed=seed)[1]["sim_params"] for seed in range(60)]
@@ -106,17 +97,15 @@ def test_every_sim_param_changes_the_future(env, name):
 
 def test_state_round_trip(env, name):
     """A copied state has the same future, the next step included."""
-    actions, world = actions_of(name, "random", 30), env.unwrapped
+    actions, world, futures = actions_of(name, "random", 30), env.unwrapped, []
     record(env, actions[:10], seed=0)
     state, sim_params, obs = world.get_state(), world.sim_params, world.observation()
-    future = [env.step(action)[:2] for action in actions[10:]]
-    env.reset(seed=99, options={"sim_params": sim_params})
-    world.set_state(state)
-    np.testing.assert_array_equal(world.observation(), obs)
-    for action, (next_obs, reward) in zip(actions[10:], future, strict=True):
-        step = env.step(action)
-        np.testing.assert_array_equal(step[0], next_obs)
-        assert step[1] == reward
+    for _ in range(2):
+        np.testing.assert_array_equal(world.observation(), obs)
+        futures.append([np.append(*env.step(action)[:2]) for action in actions[10:]])
+        env.reset(seed=99, options={"sim_params": sim_params})
+        world.set_state(state)
+    np.testing.assert_array_equal(*futures)
 
 
 @pytest.mark.parametrize("value", [-0.5, np.nan, np.inf, "heavy", None])
@@ -133,8 +122,6 @@ def test_unknown_names_are_refused_with_a_hint(env, name):
     key = next(iter(env_spec(name).default_sim_params))
     with pytest.raises(ConfigError, match=f"Did you mean '{key}'"):
         env.reset(options={"sim_params": {key + "s": 1.0}})
-    with pytest.raises(ConfigError, match="Did you mean 'sim_params'"):
-        env.reset(options={"sim_param": {key: 1.0}})
     with pytest.raises(UnknownNameError, match="option"):
         envs.make(name, no_such_option=True)
     with pytest.raises(ConfigError):
@@ -161,32 +148,12 @@ def test_a_simulation_that_diverges_is_told_and_a_good_state_ends_the_trouble(
     tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log there
-    env, other = envs.make("hopper"), envs.make("hopper")
-    for one in (env, other):
-        one.reset(seed=0)
+    env = envs.make("hopper")
+    env.reset(seed=0)
     good, action = env.unwrapped.get_state(), env.action_space.sample()
-    bad = good.copy()
-    bad[6:12] = 1e12
-    env.unwrapped.set_state(bad)
+    obs = env.step(action)[0]
+    env.unwrapped.set_state(np.where(np.arange(len(good)) < 6, good, 1e12))
     with pytest.raises(BrokenEpisodeError, match=r"diverged \(BADQVEL\) under sim_params"):
         env.step(action)
     env.unwrapped.set_state(good)
-    np.testing.assert_array_equal(env.step(action)[0], other.step(action)[0])
-
-
-def test_leaving_the_track_ends_the_episode_if_asked_for():
-    for ends in (False, True):
-        env = envs.make("cartpole-swingup", terminate_off_track=ends)
-        env.reset(seed=0)
-        steps = [env.step(np.ones(1, np.float32)) for _ in range(200)]
-        off = [abs(step[0][0]) > np.float32(2.4) for step in steps]
-        assert any(off)
-        assert [step[2] for step in steps] == [flag and ends for flag in off]
-
-
-def test_unknown_environments_are_refused_with_a_hint():
-    for call in (envs.make, lambda name: envs.make_vec(name, 2)):
-        with pytest.raises(UnknownNameError, match="Did you mean 'hopper'"):
-            call("hoper")
-        with pytest.raises(UnknownNameError, match="Did you mean 'headway/Hopper-v0'"):
-            call("headway/Hoper-v0")
+    np.testing.assert_array_equal(env.step(action)[0], obs)

@@ -19,35 +19,25 @@ def stepped(env, state, action, **sim_params):
     return env.unwrapped.get_state(), obs, reward
 
 
-def test_pendulum_step():
+@pytest.mark.parametrize(
+    ("start", "torque", "length", "mass", "spin", "wrapped"),
+    [
+        # 1.5 g/l sin θ + 3 u/(m l²) = 30 sin 0.3 + 18 = 26.86560619984019
+        ([0.3, -1.0], 1.5, 0.5, 1.0, -1.0 + 0.05 * 26.86560619984019, 0.3),
+        # 3 u/(m l²) dt = 6 / 0.0625 · 0.05 = 4.8; the angle moves before the speed is clipped
+        ([0.0, 7.9], 2.0, 0.25, 1.0, 12.7, 0.0),
+        ([0.0, 0.0], 1.0, 1.0, 1.0, 0.15, 0.0),
+        ([0.0, 0.0], 1.0, 1.0, 2.0, 0.075, 0.0),  # mass divides the torque only
+        ([2 * np.pi + 0.1, 0.0], 0.0, 1.0, 1.0, 0.75 * np.sin(0.1), 0.1),  # reward wraps angles
+    ],
+)
+def test_pendulum_step(start, torque, length, mass, spin, wrapped):
     env = envs.make("pendulum")
-    state, obs, reward = stepped(env, [0.3, -1.0], [1.5], length=0.5, mass=1.0)
-    # 1.5 g/l sin θ + 3 u/(m l²) = 30 sin 0.3 + 18 = 26.86560619984019
-    spin = -1.0 + 0.05 * 26.86560619984019
-    np.testing.assert_allclose(state, [0.3 + 0.05 * spin, spin], rtol=1e-14)
-    np.testing.assert_allclose(obs, [np.cos(state[0]), np.sin(state[0]), spin], rtol=1e-6)
-    assert reward == pytest.approx(-(0.09 + 0.1 + 0.001 * 2.25), rel=1e-12)
-
-
-def test_pendulum_integrates_before_it_clips():
-    env = envs.make("pendulum")
-    state, _, _ = stepped(env, [0.0, 7.9], [2.0], length=0.25, mass=1.0)
-    # 3 u/(m l²) dt = 6 / 0.0625 · 0.05 = 4.8
-    np.testing.assert_allclose(state, [0.05 * 12.7, 8.0], rtol=1e-12)
-
-
-def test_pendulum_mass_divides_the_torque_only():
-    env = envs.make("pendulum")
-    light = stepped(env, [0.0, 0.0], [1.0], length=1.0, mass=1.0)[0][1]
-    heavy = stepped(env, [0.0, 0.0], [1.0], length=1.0, mass=2.0)[0][1]
-    assert light == pytest.approx(0.15)
-    assert heavy == pytest.approx(0.075)
-
-
-def test_pendulum_reward_wraps_the_angle():
-    env = envs.make("pendulum")
-    reward = stepped(env, [2 * np.pi + 0.1, 0.0], [0.0], length=1.0, mass=1.0)[2]
-    assert reward == pytest.approx(-0.01, rel=1e-9)
+    state, obs, reward = stepped(env, start, [torque], length=length, mass=mass)
+    np.testing.assert_allclose(state, [start[0] + 0.05 * spin, min(spin, 8.0)], rtol=1e-12)
+    np.testing.assert_allclose(obs, [np.cos(state[0]), np.sin(state[0]), state[1]], rtol=1e-6)
+    cost = wrapped**2 + 0.1 * start[1] ** 2 + 0.001 * torque**2
+    assert reward == pytest.approx(-cost, rel=1e-9)
 
 
 def test_pendulum_reset():
@@ -64,22 +54,11 @@ def test_cartpole_step(scale):
     state, obs, reward = stepped(env, [x, v, angle, spin], [action], mass_scale=scale)
     # Newton's equations of cart and uniform rod, solved instead of written out:
     # M ẍ - (m l/2) cos θ θ̈ + ... with the rod's inertia m l²/3 about its end.
-    m = mc = 0.5 * scale
-    length, g, b = 0.6, 9.82, 0.1
-    force = 10 * np.float32(action) - b * v
     # `θ` of the source grows towards negative x when its sine enters as below.
-    lhs = np.array(
-        [
-            [m + mc, -0.5 * m * length * np.cos(angle)],
-            [-0.5 * m * length * np.cos(angle), m * length**2 / 3],
-        ]
-    )
-    rhs = np.array(
-        [
-            force - 0.5 * m * length * spin**2 * np.sin(angle),
-            0.5 * m * g * length * np.sin(angle),
-        ]
-    )
+    m, length, g = 0.5 * scale, 0.6, 9.82
+    arm, force = 0.5 * m * length, 10 * np.float32(action) - 0.1 * v
+    lhs = [[2 * m, -arm * np.cos(angle)], [-arm * np.cos(angle), m * length**2 / 3]]
+    rhs = [force - arm * spin**2 * np.sin(angle), arm * g * np.sin(angle)]
     x_dd, angle_dd = np.linalg.solve(lhs, rhs)
     expected = [x + 0.01 * v, v + 0.01 * x_dd, angle + 0.01 * spin, spin + 0.01 * angle_dd]
     np.testing.assert_allclose(state, expected, rtol=1e-7)
@@ -100,67 +79,55 @@ def raw(env):
     return data.qpos.copy(), data.qvel.copy()
 
 
-def test_hopper_observation_and_reward():
-    env = envs.make("hopper")
+def rotation(quaternion):
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return matrix
+
+
+# Seconds of a step, the observation, and the reward, of positions q and velocities v after it,
+# velocities b before it, the average velocity u, and the sum e of squared actions.
+LAWS = {
+    "hopper": (
+        0.008,
+        lambda q, v, u: [*q[1:], *np.clip(v, -10, 10), u],
+        lambda q, b, u, e: u + 1 - 1e-3 * e,
+    ),
+    "slim-humanoid": (
+        0.015,
+        lambda q, v, u: [*q[2:], *v],
+        lambda q, b, u, e: 0.25 / 0.015 * b[0] - 0.1 * e + 5.0 * (1.0 <= q[2] <= 2.0),
+    ),
+    "half-cheetah": (0.05, lambda q, v, u: [u, *q[1:], *v], lambda q, b, u, e: u - 0.1 * e),
+    "crippled-ant": (
+        0.05,
+        lambda q, v, u: [*q, *v, *rotation(q[3:7]), *q[:3]],
+        lambda q, b, u, e: u + 0.05,
+    ),
+}
+
+
+RELEASED = ("hopper", {"observe_average_velocity": False}, slice(11))
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "seen"), [*((name, {}, slice(None)) for name in LAWS), RELEASED]
+)
+def test_observations_and_rewards_of_robots(name, options, seen):
+    env, (seconds, observation, reward) = envs.make(name, **options), LAWS[name]
     obs, _ = env.reset(seed=1)
-    assert obs[11] == 0.0
-    for action in actions_of("hopper", "extreme", 60):
-        before, (obs, reward, *_) = raw(env), env.step(action)
-        qpos, qvel = raw(env)
-        velocity = (qpos[0] - before[0][0]) / 0.008
-        np.testing.assert_array_equal(obs[:11], [*qpos[1:], *np.clip(qvel, -10, 10)])
-        assert obs[11] == pytest.approx(velocity, rel=1e-12)
-        assert reward == pytest.approx(velocity + 1 - 1e-3 * np.sum(action**2), rel=1e-6)
-    assert np.abs(qvel).max() > 0
-
-
-def test_hopper_as_released():
-    new, old = envs.make("hopper"), envs.make("hopper", observe_average_velocity=False)
-    assert old.reset(seed=1)[0].shape == (11,)
-    np.testing.assert_array_equal(old.reset(seed=1)[0], new.reset(seed=1)[0][:11])
-    action = np.full(3, 0.3, np.float32)
-    a, b = new.step(action), old.step(action)
-    np.testing.assert_array_equal(b[0], a[0][:11])
-    assert b[1] == a[1]
-
-
-def test_slim_humanoid_observation_and_reward():
-    env = envs.make("slim-humanoid")
-    env.reset(seed=1)
+    np.testing.assert_allclose(obs, observation(*raw(env), 0.0)[seen], atol=1e-14)
     heights = []
-    for action in actions_of("slim-humanoid", "extreme", 150):
-        before, (obs, reward, *_) = raw(env), env.step(action)
+    for action in actions_of(name, "extreme", 150):
+        (start, before), (obs, paid, *_) = raw(env), env.step(action)
         qpos, qvel = raw(env)
-        np.testing.assert_array_equal(obs, [*qpos[2:], *qvel])
+        velocity, effort = (qpos[0] - start[0]) / seconds, np.sum(action.astype(float) ** 2)
+        expected = observation(qpos, qvel, velocity)[seen]
+        np.testing.assert_allclose(obs, expected, rtol=1e-12, atol=1e-14)
+        assert paid == pytest.approx(reward(qpos, before, velocity, effort), rel=1e-9, abs=1e-9)
         heights.append(qpos[2])
-        paid = 0.25 / 0.015 * before[1][0] - 0.1 * np.sum(action.astype(float) ** 2)
-        assert reward == pytest.approx(paid + 5.0 * (1.0 <= qpos[2] <= 2.0), rel=1e-9)
-    assert min(heights) < 1.0 < max(heights)  # the bonus was paid, and was not
-
-
-def test_half_cheetah_observation_and_reward():
-    env = envs.make("half-cheetah")
-    obs, _ = env.reset(seed=1)
-    assert obs[0] == 0.0
-    for action in actions_of("half-cheetah", "random", 40):
-        before, (obs, reward, *_) = raw(env), env.step(action)
-        qpos, qvel = raw(env)
-        velocity = (qpos[0] - before[0][0]) / 0.05
-        np.testing.assert_allclose(obs, [velocity, *qpos[1:], *qvel], rtol=1e-12)
-        assert reward == pytest.approx(velocity - 0.1 * np.sum(action**2), rel=1e-6)
-
-
-def test_crippled_ant_observation_and_reward():
-    env = envs.make("crippled-ant")
-    env.reset(seed=1)
-    for action in actions_of("crippled-ant", "extreme", 30):
-        before, (obs, reward, *_) = raw(env), env.step(action)
-        qpos, qvel = raw(env)
-        rotation = np.zeros(9)
-        mujoco.mju_quat2Mat(rotation, qpos[3:7])
-        np.testing.assert_allclose(obs, [*qpos, *qvel, *rotation, *qpos[:3]], atol=1e-14)
-        velocity = (qpos[0] - before[0][0]) / 0.05
-        assert reward == pytest.approx(velocity + 0.05, rel=1e-9)
+    if name == "slim-humanoid":
+        assert min(heights) < 1.0 < max(heights)  # the bonus was paid, and was not
 
 
 @pytest.mark.parametrize(
@@ -176,22 +143,19 @@ def test_crippled_leg_gets_no_control(leg, silent):
 
 
 def test_crippled_leg_shrinks_only_if_asked_for():
-    plain, small = envs.make("crippled-ant"), envs.make("crippled-ant", shrink_leg=True)
-    nominal = load_model("ant.xml")
-    for env in (plain, small):
-        env.reset(seed=0, options={"sim_params": {"crippled_leg": 3}})
-        env.reset(seed=0, options={"sim_params": {"crippled_leg": 1}})
-    upper, lower = (nominal.geom(n).id for n in ("right_leg_geom", "right_ankle_geom"))
-    changed = np.flatnonzero(
-        (small.unwrapped.vector.models[0].geom_size != nominal.geom_size).any(1)
-    )
-    np.testing.assert_array_equal(plain.unwrapped.vector.models[0].geom_size, nominal.geom_size)
-    np.testing.assert_array_equal(changed, sorted([upper, lower]))
-    half = nominal.geom_size[[upper, lower]] / 2
-    np.testing.assert_array_equal(small.unwrapped.vector.models[0].geom_size[[upper, lower]], half)
-    np.testing.assert_array_equal(
-        small.unwrapped.vector.models[0].geom_pos[lower], nominal.geom_pos[upper]
-    )
+    nominal, models = load_model("ant.xml"), []
+    for shrink_leg in (False, True):
+        env = envs.make("crippled-ant", shrink_leg=shrink_leg)
+        for leg in (3, 1):
+            env.reset(seed=0, options={"sim_params": {"crippled_leg": leg}})
+        models.append(env.unwrapped.vector.models[0])
+    plain, small = models
+    leg = upper, lower = [nominal.geom(n).id for n in ("right_leg_geom", "right_ankle_geom")]
+    expected = nominal.geom_size.copy()
+    np.testing.assert_array_equal(plain.geom_size, expected)
+    expected[leg] /= 2
+    np.testing.assert_array_equal(small.geom_size, expected)
+    np.testing.assert_array_equal(small.geom_pos[lower], nominal.geom_pos[upper])
 
 
 @pytest.mark.parametrize("name", [n for n in ROBOTS if n != "crippled-ant"])
@@ -211,38 +175,26 @@ def test_scales_change_what_they_say_and_nothing_else(name, scale_inertia):
 
 
 @pytest.mark.parametrize(
-    ("name", "noise"),
-    [("hopper", 0.005), ("slim-humanoid", 0.01), ("half-cheetah", None), ("crippled-ant", 0.1)],
+    ("name", "positions", "velocities"),
+    [
+        ("hopper", ("max", 0.005), ("max", 0.005)),
+        ("slim-humanoid", ("max", 0.01), ("max", 0.01)),
+        ("half-cheetah", ("std", 0.001), ("std", 0.001)),
+        ("crippled-ant", ("max", 0.1), ("std", 0.1)),
+    ],
 )
-def test_robot_resets(name, noise):
+def test_robot_resets(name, positions, velocities):
+    """Uniform noise has a largest value, normal noise a standard deviation."""
     env = envs.make(name)
-    starts = [(env.reset(seed=s), raw(env))[1] for s in range(200)]
-    nominal = env.unwrapped.vector.world.nominal
-    away = np.array([qpos - nominal.qpos0 for qpos, _ in starts])
-    speed = np.array([qvel for _, qvel in starts])
+    starts = [env.reset(seed=s) and raw(env) for s in range(200)]
+    qpos, qvel = (np.array(values) for values in zip(*starts, strict=True))
+    noise = qpos - env.unwrapped.vector.world.nominal.qpos0
     if name in ("slim-humanoid", "crippled-ant"):
-        norms = [np.linalg.norm(qpos[3:7]) for qpos, _ in starts]
-        np.testing.assert_allclose(norms, 1.0, rtol=1e-12)
-        away = np.delete(away, range(3, 7), axis=1)
-    if noise is None:
-        np.testing.assert_allclose(away.std(), 0.001, rtol=0.1)
-        np.testing.assert_allclose(speed.std(), 0.001, rtol=0.1)
-        return
-    assert 0.95 * noise < np.abs(away).max() <= noise
-    if name == "crippled-ant":
-        np.testing.assert_allclose(speed.std(), 0.1, rtol=0.1)
-    else:
-        assert 0.95 * noise < np.abs(speed).max() <= noise
-
-
-def test_masses_of_the_models():
-    """Exact capsules; the half cheetah weighs 14 kg in total."""
-    assert load_model("hopper.xml").body_mass.sum() == pytest.approx(15.820, abs=1e-3)
-    assert load_model("half_cheetah.xml").body_mass.sum() == pytest.approx(14.0)
-    assert load_model("ant.xml").body_mass.sum() == pytest.approx(0.9109, abs=1e-4)
-    assert load_model("humanoid.xml").body_mass.sum() == pytest.approx(42.116, abs=1e-3)
-    control_steps = [envs.make(name).unwrapped.vector.world.time_step for name in ROBOTS]
-    assert control_steps == pytest.approx([0.008, 0.015, 0.05, 0.05])
+        np.testing.assert_allclose(np.linalg.norm(qpos[:, 3:7], axis=1), 1.0, rtol=1e-12)
+        noise = np.delete(noise, range(3, 7), axis=1)
+    for values, (kind, size) in ((noise, positions), (qvel, velocities)):
+        found = np.abs(values).max() if kind == "max" else values.std()
+        assert 0.9 * size < found < (1.0 + 1e-9 if kind == "max" else 1.1) * size
 
 
 @pytest.mark.parametrize("xml", ["hopper.xml", "humanoid.xml", "half_cheetah.xml", "ant.xml"])

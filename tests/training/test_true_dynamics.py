@@ -64,7 +64,7 @@ def test_compiled_equations_step_as_the_environment_under_every_physics(env):
     sim_params = {k: jnp.asarray(v, jnp.float32) for k, v in vector.sim_params.items()}
     step = jax.jit(lambda s, a: vector.world.next_state(s, a, sim_params, jnp))
     for _ in range(12):
-        before = vector.states
+        before = vector.states.copy()
         actions = random_actions(environments, rng)
         obs = vector.step(actions)[0]
         found = step(jnp.asarray(before, jnp.float32), jnp.asarray(actions))

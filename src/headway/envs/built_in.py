@@ -18,20 +18,12 @@ from gymnasium.spaces import Box
 from jaxtyping import Float
 
 from headway.cpus import num_cpus
-from headway.envs.vector import (
-    Begun,
-    HeadwayVectorEnv,
-    Outcome,
-    ProcessVectorEnv,
-    SequentialVectorEnv,
-    SimParams,
-)
+from headway.envs.vector import HeadwayVectorEnv, ProcessVectorEnv, SequentialVectorEnv, SimParams
 from headway.errors import BrokenEpisodeError, ConfigError
 from headway.sim_params import SimParamSets
 from headway.task import env_spec
 from headway.worlds import classic, locomotion
 from headway.worlds.base import World
-from headway.worlds.classic import ClassicWorld
 from headway.worlds.locomotion import Robot, RobotState
 
 _WORLDS: Mapping[str, type[World]] = {
@@ -50,29 +42,21 @@ class WorldVectorEnv(HeadwayVectorEnv):
         super().__init__(num_envs, spaces, episode_length)
         self.world: Any = world
         for i in range(num_envs):
-            self._note_sim_params(i, world.spec.default_sim_params)
+            self._note(i, world.spec.default_sim_params)
 
     def _check_actions(self, actions: np.ndarray) -> np.ndarray:
         actions = np.asarray(super()._check_actions(actions), np.float64)
-        if not np.isfinite(actions).all():
-            raise ConfigError(
-                f"{self.world.spec.name} was given the actions {actions.tolist()}, allowed: finite"
-                " numbers."
-            )
         return np.clip(actions, self.action_space.low, self.action_space.high)
 
     def _check_sim_params(self, values: dict[str, Any]) -> SimParams:
         return self.world.check(values)
 
-    def _begin(self, seeds: Mapping[int, int | None], requested: Sequence[SimParams]) -> Begun:
-        begun: Begun = {}
+    def _begin(self, seeds: Mapping[int, int | None], requested: Sequence[SimParams]) -> None:
         for i in seeds:
             self._set_state(i, self.world.initial_state(self.rngs[i]))
             # What was requested is drawn all the same, so the next draws do not depend on it.
             drawn = self.world.sim_params.sample(self.rngs[i])
-            begun[i] = sim_params = self.world.spec.default_sim_params | drawn | requested[i]
-            self.set_sim_params(i, sim_params)
-        return begun
+            self.set_sim_params(i, self.world.spec.default_sim_params | drawn | requested[i])
 
     def physics(self, i: int) -> SimParams:
         """Simulator parameters of environment `i` now in force."""
@@ -85,7 +69,7 @@ class WorldVectorEnv(HeadwayVectorEnv):
             ConfigError: A parameter or value is not allowed.
         """
         checked = self.world.check(values)
-        self._note_sim_params(i, checked)
+        self._note(i, checked)
         self._change(i, checked)
 
     def set_state(self, i: int, state: np.ndarray) -> None:
@@ -120,47 +104,40 @@ class WorldVectorEnv(HeadwayVectorEnv):
 class ClassicVectorEnv(WorldVectorEnv):
     """Many copies of a classic world, stepped by one NumPy formula."""
 
-    world: ClassicWorld
-
-    def __init__(self, world: ClassicWorld, num_envs: int, episode_length: int | None = None):
+    def __init__(self, world: World, num_envs: int, episode_length: int | None = None):
         super().__init__(world, num_envs, episode_length)
-        self._state = np.zeros((num_envs, world.state_size))
-        self._action = np.zeros((num_envs, world.task.action_size))
-
-    @property
-    def states(self) -> np.ndarray:
-        """The physical states [env, state] as they are now."""
-        return self._state.copy()
+        # As they are now, and the actions that led there: [env, ...].
+        self.states = np.zeros((num_envs, self.world.state_size))
+        self._action = np.zeros((num_envs, self.world.task.action_size))
 
     def _change(self, i: int, changed: SimParams) -> None:
         """Nothing: the formula reads what is noted."""
 
-    def _advance(self, active: np.ndarray, actions: np.ndarray) -> Outcome:
+    def _advance(self, active: np.ndarray, actions: np.ndarray, rewards: np.ndarray) -> None:
         sim_params = {name: values[active] for name, values in self._sim_params.items()}
-        state, action = self._state[active], actions[active]
+        state, action = self.states[active], actions[active]
         after = self.world.next_state(state, action, sim_params)
-        self._state[active], self._action[active] = after, action
-        terminated = self.world.terminated(after)
-        reward = self.world.reward(state, action, after)
-        return reward, np.stack([terminated, np.zeros_like(terminated)]), {}
+        self.states[active], self._action[active] = after, action
+        self._ends[0, active] = self.world.terminated(after)
+        rewards[active] = self.world.reward(state, action, after)
 
     def observe(self) -> np.ndarray:
         """Observe all states."""
-        return self.world.observe(self._state)
+        return self.world.observe(self.states)
 
     def get_state(self, i: int) -> np.ndarray:
         """Return positions and velocities."""
-        return self._state[i].copy()
+        return self.states[i].copy()
 
     def _set_state(self, i: int, state: np.ndarray) -> None:
-        self._state[i], self._action[i] = state, 0.0
+        self.states[i], self._action[i] = state, 0.0
 
     def frame(self, i: int) -> np.ndarray:
         """Draw the state and the action that led to it."""
         from headway.worlds import rendering
 
         draw = rendering.DRAWINGS[self.world.spec.name]
-        return draw(self._state[i], float(self._action[i, 0]), self.physics(i))
+        return draw(self.states[i], float(self._action[i, 0]), self.physics(i))
 
 
 class RobotVectorEnv(WorldVectorEnv):
@@ -169,8 +146,6 @@ class RobotVectorEnv(WorldVectorEnv):
     `mj_step` frees Python's lock, so threads share the environments. Every `MjData` keeps its
     constraint solver's last result (`qacc_warmstart`), so neighbours change no number.
     """
-
-    world: Robot
 
     def __init__(self, world: Robot, num_envs: int, episode_length: int | None = None):
         super().__init__(world, num_envs, episode_length)
@@ -184,7 +159,7 @@ class RobotVectorEnv(WorldVectorEnv):
     def _change(self, i: int, changed: SimParams) -> None:
         self.world.set_physics(self.models[i], self.physics(i))
 
-    def _advance(self, active: np.ndarray, actions: np.ndarray) -> Outcome:
+    def _advance(self, active: np.ndarray, actions: np.ndarray, rewards: np.ndarray) -> None:
         def step(share: np.ndarray) -> None:
             for i in share:
                 mujoco.mj_step(self.models[i], self.datas[i], nstep=self.world.frame_skip)
@@ -198,16 +173,14 @@ class RobotVectorEnv(WorldVectorEnv):
         step(first)  # in this thread, meanwhile
         list(begun)  # wait for the others
         qpos, qvel, _ = self._robot_state()
-        after = self.world.after_step(before, qpos, qvel)
+        after = self.world.after_step(before.qpos, qpos, qvel)
         self.velocity[active] = after.velocity[active]
-        reward = self.world.reward(before, actions, after)[active]
-        broken = {}
+        rewards[active] = self.world.reward(before, actions, after)[active]
         for i in active.tolist():  # after huge numbers MuJoCo quietly starts over, but warns
             counts = self.datas[i].warning.number
             if counts.any():
                 name = mujoco.mjtWarning(int(np.argmax(counts))).name.removeprefix("mjWARN_")
-                broken[i] = f"the simulation of {self.world.spec.name} diverged ({name})"
-        return reward, np.zeros((2, len(active)), bool), broken
+                self._broken[i] = f"the simulation of {self.world.spec.name} diverged ({name})"
 
     def _robot_state(self) -> RobotState:
         qpos = np.array([data.qpos for data in self.datas])
@@ -255,8 +228,7 @@ class RobotVectorEnv(WorldVectorEnv):
         world, data, sim_params = self.world, self.datas[i], self.physics(i)
         model, datas, rollout = self._rollout
         world.set_physics(model, sim_params)
-        count, horizon = actions.shape[:2]
-        skip, nq, nv = world.frame_skip, model.nq, model.nv
+        count, skip, nq, nv = len(actions), world.frame_skip, model.nq, model.nv
         full_physics = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
         start = np.empty(mujoco.mj_stateSize(model, full_physics))
         mujoco.mj_getState(self.models[i], data, start, full_physics)
@@ -276,11 +248,10 @@ class RobotVectorEnv(WorldVectorEnv):
         first = np.broadcast_to(start, (count, 1, len(start)))
         reached = np.concatenate([first, states[:, skip - 1 :: skip]], axis=1)
         qpos, qvel = reached[..., 1 : 1 + nq], reached[..., 1 + nq : 1 + nq + nv]
-        before = RobotState(qpos[:, :-1], qvel[:, :-1], np.zeros((count, horizon)))
-        after = world.after_step(before, qpos[:, 1:], qvel[:, 1:])
+        after = world.after_step(qpos[:, :-1], qpos[:, 1:], qvel[:, 1:])
         now = np.full((count, 1), self.velocity[i])
         velocity = np.concatenate([now, after.velocity[:, :-1]], axis=1)
-        return before._replace(velocity=velocity), after
+        return RobotState(qpos[:, :-1], qvel[:, :-1], velocity), after
 
     def frame(self, i: int) -> np.ndarray:
         """Draw the robot.

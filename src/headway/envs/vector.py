@@ -26,6 +26,7 @@ from headway.errors import (
     BrokenEpisodeError,
     ConfigError,
     HeadwayError,
+    shown,
     unknown_name,
 )
 from headway.sim_params import SimParamSets
@@ -33,13 +34,9 @@ from headway.sim_params import SimParamSets
 SimParams = dict[str, float]
 Schedule = Mapping[int, Mapping[str, float]]
 """New simulator parameters by the step before which they come into force; 0 is the first."""
+Makers = Sequence[Callable[[], gymnasium.Env]]
 Spaces = tuple[gymnasium.Space, gymnasium.Space]
 """Observation and action space."""
-Begun = dict[int, SimParams | BrokenEpisodeError]
-"""Simulator parameters of the episodes that began by environment, or why one cannot begin."""
-Outcome = tuple[np.ndarray, np.ndarray, dict[int, str]]
-"""Reward [env] and ends [2 (terminated, truncated), env] of those that were stepped; which
-episodes cannot go on, and why."""
 
 
 class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -98,33 +95,27 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         for name in options:
             if name not in known:
                 raise ConfigError(str(unknown_name("reset option", str(name), known)))
+        each: Any = seed
         if seed is None or isinstance(seed, int | np.integer):
-            seed = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
-        seed = [None if own is None else int(own) for own in seed]
-        if len(seed) != self.num_envs:
+            each = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+        if len(each) != self.num_envs:
             raise ConfigError(
-                f"seed has {len(seed)} entries, allowed: an int, or {self.num_envs} of them."
+                f"seed has {len(each)} entries, allowed: an int, or {self.num_envs} of them."
             )
         requested = self._read_sim_params(options.get("sim_params") or {})
         schedules = self._read_schedules(options.get("schedule") or {})
         mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ConfigError(f"reset_mask is {mask}, allowed: {self.num_envs} booleans.")
-        seeds = {i: seed[i] for i in np.flatnonzero(mask).tolist()}
+        seeds = {
+            i: None if each[i] is None else int(each[i]) for i in np.flatnonzero(mask).tolist()
+        }
         for i, own in seeds.items():
             if own is not None or self.rngs[i] is None:
                 self.rngs[i] = seeding.np_random(own)[0]
-        for i, begun in self._begin(seeds, requested).items():
-            failed = isinstance(begun, BrokenEpisodeError)
-            self._elapsed[i], self._ends[:, i], self._schedules[i] = (
-                0,
-                (False, failed),
-                schedules[i],
-            )
+            self._elapsed[i], self._ends[:, i], self._schedules[i] = 0, False, schedules[i]
             self._broken.pop(i, None)
-            if failed:
-                self._broken[i] = str(begun)
-            self._note_sim_params(i, requested[i] if failed else begun)
+        self._begin(seeds, requested)
         return self._result()
 
     def step(
@@ -141,15 +132,13 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         for i in active.tolist():
             changed = self._schedules[i].get(int(self._elapsed[i]))
             if changed:
-                self._note_sim_params(i, changed)
+                self._note(i, changed)
                 self._change(i, changed)
         if active.size:
             self._elapsed[active] += 1
-            rewards[active], ends, broken = self._advance(active, actions)
-            ends[1] |= self._elapsed[active] >= (self.episode_length or np.inf)
-            self._ends[:, active] = ends
-            rewards[list(broken)], self._ends[1, list(broken)] = np.nan, True
-            self._broken |= broken
+            self._advance(active, actions, rewards)
+            self._ends[1, active] |= self._elapsed[active] >= (self.episode_length or np.inf)
+        rewards[[i for i in active if i in self._broken]] = np.nan
         obs, info = self._result()
         terminated, truncated = self._ends.copy()
         return obs, rewards, terminated, truncated, info
@@ -160,15 +149,17 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return {name: values.copy() for name, values in self._sim_params.items()}
 
     def _result(self) -> tuple[np.ndarray, dict[str, Any]]:
-        """Observations, NaN where an episode broke, and infos."""
+        """Observations, NaN where an episode broke, which is cut, and infos."""
         obs, info = self.observe(), {"sim_params": self.sim_params}
         if not self._broken:
             return obs, info
+        self._ends[1, list(self._broken)] = True
         if obs.dtype.kind == "f":
             obs[list(self._broken)] = np.nan
         return obs, info | {"broken": dict(self._broken)}
 
-    def _note_sim_params(self, i: int, values: Mapping[str, float]) -> None:
+    def _note(self, i: int, values: Mapping[str, float]) -> None:
+        """Note the simulator parameters of environment `i` that are in force from now on."""
         for name, value in values.items():
             self._sim_params.setdefault(name, np.full(self.num_envs, np.nan))[i] = value
 
@@ -212,25 +203,31 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return values
 
     def _check_actions(self, actions: np.ndarray) -> np.ndarray:
-        allowed = self.action_space.shape
-        if allowed is not None and np.shape(actions) != allowed:
+        got, allowed = np.shape(actions), self.action_space.shape
+        if allowed is not None and (got != allowed or not np.isfinite(actions).all()):
             raise ConfigError(
-                f"actions have shape {np.shape(actions)}, allowed: {allowed}, a row for each"
-                " environment."
+                f"actions are {shown(np.asarray(actions).tolist())} of shape {got}, allowed: finite"
+                f" numbers of shape {allowed}, a row for each environment."
             )
         return actions
 
     @abc.abstractmethod
-    def _begin(self, seeds: Mapping[int, int | None], requested: Sequence[SimParams]) -> Begun:
-        """Start episodes in the environments that have a seed or None, with their `rngs`."""
+    def _begin(self, seeds: Mapping[int, int | None], requested: Sequence[SimParams]) -> None:
+        """Start episodes in the environments that have a seed or None, with their `rngs`.
+
+        Their simulator parameters are noted; why one cannot begin is put into `_broken`.
+        """
 
     @abc.abstractmethod
     def _change(self, i: int, changed: SimParams) -> None:
         """Change the physics of environment `i` before its next step; they are noted already."""
 
     @abc.abstractmethod
-    def _advance(self, active: np.ndarray, actions: np.ndarray) -> Outcome:
-        """Step the environments of the given indices; `actions` has a row for each of all."""
+    def _advance(self, active: np.ndarray, actions: np.ndarray, rewards: np.ndarray) -> None:
+        """Step the environments of the given indices; actions and rewards have a row for each.
+
+        Fills in rewards, `_ends` and, where an episode cannot go on, `_broken`.
+        """
 
     @abc.abstractmethod
     def observe(self) -> np.ndarray:
@@ -256,7 +253,7 @@ class SequentialVectorEnv(HeadwayVectorEnv):
 
     def __init__(
         self,
-        env_fns: Sequence[Callable[[], gymnasium.Env]],
+        env_fns: Makers,
         *,
         sim_params: SimParamSets | None = None,
         episode_length: int | None = None,
@@ -264,60 +261,56 @@ class SequentialVectorEnv(HeadwayVectorEnv):
         if not env_fns:
             raise ConfigError("env_fns is empty, allowed: at least one.")
         self.envs: list[Any] = self._make_all(env_fns)
-        spaces = list(self._call("spaces", dict.fromkeys(range(len(env_fns)), ())).values())
+        spaces = [self._spaces(env) for env in self.envs]
         super().__init__(len(spaces), spaces[0], episode_length)
         for own in spaces:
             self._check_spaces(own)
         self._sets, self._changes = sim_params, {}
         self._obs: list[Any] = [np.zeros(spaces[0][0].shape or ()) for _ in spaces]
 
-    def _make_all(self, env_fns: Sequence[Callable[[], gymnasium.Env]]) -> list[Any]:
+    def _make_all(self, env_fns: Makers) -> list[Any]:
         return [make() for make in env_fns]
 
+    def _spaces(self, env: Any) -> Spaces:
+        return env.observation_space, env.action_space
+
     def _call(self, method: str, calls: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
-        """Let some environments answer, as in `_answer`; a `BrokenEpisodeError` is an answer."""
-        found: dict[int, Any] = {}
+        """Let some environments answer, as in `_answer`; those that break do not."""
+        answers: dict[int, Any] = {}
         for i, given in calls.items():
             try:
-                found[i] = _answer(self.envs[i], method, *given)
+                answers[i] = _answer(self.envs[i], method, *given)
             except BrokenEpisodeError as error:
-                found[i] = error
-        return found
+                self._broken[i] = str(error)
+        return answers
 
-    def _begin(self, seeds: Mapping[int, int | None], requested: Sequence[SimParams]) -> Begun:
+    def _begin(self, seeds: Mapping[int, int | None], requested: Sequence[SimParams]) -> None:
         asked = {i: requested[i] for i in seeds}
         if self._sets is not None:
             asked = {i: self._sets.sample(self.rngs[i]) | given for i, given in asked.items()}
+        for i, given in asked.items():
+            self._note(i, given)
         options = {i: {"sim_params": given} if given else None for i, given in asked.items()}
         begun = self._call("reset", {i: (seeds[i], options[i]) for i in seeds})
-        for i, found in begun.items():
-            if not isinstance(found, BrokenEpisodeError):
-                obs, sim_params, spaces = found
-                self._check_spaces(spaces)
-                self._obs[i], begun[i] = self._check_obs(obs), asked[i] | sim_params
-        return begun
+        for i, (obs, sim_params, spaces) in begun.items():
+            self._check_spaces(spaces)
+            self._obs[i] = self._check_obs(obs)
+            self._note(i, sim_params)
 
     def _change(self, i: int, changed: SimParams) -> None:
         self._changes[i] = changed
 
-    def _advance(self, active: np.ndarray, actions: np.ndarray) -> Outcome:
+    def _advance(self, active: np.ndarray, actions: np.ndarray, rewards: np.ndarray) -> None:
         calls = {i: (actions[i], self._changes.pop(i, None)) for i in active.tolist()}
-        found = self._call("step", calls)
-        rewards, ends, broken = np.zeros(len(active)), np.zeros((2, len(active)), bool), {}
-        for row, (i, result) in enumerate(found.items()):
-            if isinstance(result, BrokenEpisodeError):
-                broken[i] = str(result)
-                continue
-            obs, reward, *ends[:, row] = result
-            self._obs[i] = self._check_obs(obs)
+        for i, (obs, reward, *ends) in self._call("step", calls).items():
+            self._obs[i], self._ends[:, i] = self._check_obs(obs), ends
             try:
-                rewards[row] = float(reward)
+                rewards[i] = float(reward)
             except (TypeError, ValueError):
                 raise BadEnvironmentError(
                     f"an environment returned the reward {reward!r}, allowed: a number; correct"
                     " the environment."
                 ) from None
-        return rewards, ends, broken
 
     def _check_spaces(self, spaces: Spaces) -> None:
         allowed = self.single_observation_space, self.single_action_space
@@ -352,8 +345,6 @@ def _answer(env: gymnasium.Env, method: str, *given: Any) -> Any:
     `reset` gives observation, simulator parameters and spaces; `step`, maybe after a change of
     simulator parameters, all but the infos.
     """
-    if method == "spaces":
-        return env.observation_space, env.action_space
     if method == "reset":
         obs, info = env.reset(seed=given[0], options=given[1])
         return obs, info.get("sim_params", {}), (env.observation_space, env.action_space)
@@ -390,13 +381,7 @@ class ProcessVectorEnv(SequentialVectorEnv):
         BadEnvironmentError: An environment could not be made, or their spaces differ.
     """
 
-    def __init__(
-        self,
-        env_fns: Sequence[Callable[[], gymnasium.Env]],
-        *,
-        step_timeout_s: float,
-        **kwargs: Any,
-    ):
+    def __init__(self, env_fns: Makers, *, step_timeout_s: float, **kwargs: Any):
         if not step_timeout_s > 0:
             raise ConfigError(f"step_timeout_s is {step_timeout_s}, allowed: more than 0.")
         self._env_fns, self._timeout_s = list(env_fns), step_timeout_s
@@ -404,9 +389,12 @@ class ProcessVectorEnv(SequentialVectorEnv):
         self._end = weakref.finalize(self, _kill, self._living)
         super().__init__(env_fns, **kwargs)
 
-    def _make_all(self, env_fns: Sequence[Callable[[], gymnasium.Env]]) -> list[Any]:
+    def _make_all(self, env_fns: Makers) -> list[Any]:
         with ThreadPoolExecutor(len(env_fns)) as pool:  # each waits for its process to begin
             return list(pool.map(self._make_one, range(len(env_fns))))
+
+    def _spaces(self, env: Any) -> Spaces:
+        return env.single_observation_space, env.single_action_space
 
     def _make_one(self, i: int) -> AsyncVectorEnv:
         make, parent = self._env_fns[i], os.getpid()
@@ -433,26 +421,27 @@ class ProcessVectorEnv(SequentialVectorEnv):
         for i, given in calls.items():
             with contextlib.suppress(OSError):  # its process is gone; waiting will tell
                 self.envs[i].call_async("answer", method, *given)
-        found: dict[int, Any] = {}
+        answers: dict[int, Any] = {}
         for i in calls:
             env = self.envs[i]
             try:
-                (found[i],) = env.call_wait(timeout=max(0.0, ends - time.monotonic()))
+                (answers[i],) = env.call_wait(timeout=max(0.0, ends - time.monotonic()))
                 continue
             except multiprocessing.TimeoutError:
-                why = f"did not answer to {method} within {self._timeout_s:g} s"
+                self._broken[i] = f"did not answer to {method} within {self._timeout_s:g} s"
             except (EOFError, OSError, NoAsyncCallError):
                 env.processes[0].join()
                 code = env.processes[0].exitcode or 0
                 how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"over ({code})"
-                why = f"had its process {how} during {method}"
-            found[i] = BrokenEpisodeError(why)
+                self._broken[i] = f"had its process {how} during {method}"
             _kill({i: self._living.pop(i)})
             self.envs[i] = self._make_one(i)
-        for answer in found.values():  # once all have answered
-            if isinstance(answer, Exception) and not isinstance(answer, BrokenEpisodeError):
+        for i, answer in answers.items():  # once all have answered
+            if isinstance(answer, BrokenEpisodeError):
+                self._broken[i] = str(answer)
+            elif isinstance(answer, Exception):
                 raise answer
-        return found
+        return {i: answer for i, answer in answers.items() if i not in self._broken}
 
     def close_extras(self, **kwargs: Any) -> None:
         """End the processes."""

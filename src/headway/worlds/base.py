@@ -1,7 +1,7 @@
 """The laws of an environment in NumPy, for one or many copies of it alike."""
 
-import abc
 import math
+import numbers
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -14,7 +14,7 @@ from headway.task import EnvSpec
 SimParams = dict[str, float]
 
 
-class World(abc.ABC):
+class World:
     """The laws of one environment.
 
     Functions of states, observations and rewards work on arrays with any number of leading
@@ -59,10 +59,7 @@ class World(abc.ABC):
             known = self.spec.default_sim_params
             if name not in known:
                 raise ConfigError(str(unknown_name(f"{self.spec.name} sim_param", name, known)))
-            try:
-                number = float(value)
-            except (TypeError, ValueError):
-                number = math.nan
+            number = float(value) if isinstance(value, numbers.Real) else math.nan
             choices = self.choices.get(name)
             if not (number in choices if choices else 0 < number < math.inf):
                 allowed = ", ".join(map(str, choices)) if choices else "finite numbers above 0"

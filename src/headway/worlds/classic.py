@@ -4,7 +4,6 @@ Environments step the equations in NumPy's float64; a planner that knows the tru
 compiles them (`xp=jax.numpy`).
 """
 
-import abc
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -22,26 +21,15 @@ TRACK_LIMIT = 2.4
 
 
 class ClassicWorld(World):
-    """A world whose state is a few numbers and whose step is a formula."""
+    """A world whose state is a few numbers and whose step is a formula.
+
+    Subclasses write `initial_state(rng)`, `next_state(state, action, sim_params)`,
+    `observe(state)` and `reward(state, action, next_state)`; `next_state` and `observe` also
+    with `xp=jax.numpy`.
+    """
 
     obs_dtype = np.float32
     state_size: ClassVar[int]
-
-    @abc.abstractmethod
-    def initial_state(self, rng: np.random.Generator) -> np.ndarray:
-        """Draw the state that an episode starts in."""
-
-    @abc.abstractmethod
-    def next_state(self, state: Any, action: Any, sim_params: Physics, xp: Any = np) -> Any:
-        """Return the state [..., state] after a step, by `numpy` or by `jax.numpy`."""
-
-    @abc.abstractmethod
-    def observe(self, state: Any, xp: Any = np) -> Any:
-        """Return the observation [..., obs] of a state, by `numpy` or by `jax.numpy`."""
-
-    @abc.abstractmethod
-    def reward(self, state: np.ndarray, action: np.ndarray, next_state: np.ndarray) -> np.ndarray:
-        """Return the reward [...] of a step."""
 
     def terminated(self, next_state: np.ndarray) -> np.ndarray:
         """Return where a step ended the episode."""

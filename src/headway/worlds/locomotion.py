@@ -7,7 +7,6 @@ The formulas are NumPy on arrays with any number of leading axes. The models are
 files that Gymnasium ships; MuJoCo is imported when the first one is loaded.
 """
 
-import abc
 import functools
 from collections.abc import Mapping
 from importlib import resources
@@ -35,7 +34,7 @@ class RobotState(NamedTuple):
 
 
 class Robot(World):
-    """A robot that is paid for moving forward."""
+    """A robot that is paid for moving forward; subclasses write `observe(state)`."""
 
     obs_dtype = np.float64
     xml: ClassVar[str]
@@ -83,19 +82,14 @@ class Robot(World):
         del sim_params
         return action
 
-    @abc.abstractmethod
-    def observe(self, state: RobotState) -> np.ndarray:
-        """Return the observation [..., obs] of a state."""
-
     def reward(self, before: RobotState, action: np.ndarray, after: RobotState) -> np.ndarray:
         """Return the reward [...] of a step: forward velocity, being alive, and effort."""
         del before
         return after.velocity + self.alive - self.effort * np.square(action).sum(-1)
 
-    def after_step(self, before: RobotState, qpos: np.ndarray, qvel: np.ndarray) -> RobotState:
-        """Assemble the state that a step led to."""
-        velocity = (qpos[..., 0] - before.qpos[..., 0]) / self.time_step
-        return RobotState(qpos, qvel, velocity)
+    def after_step(self, before: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> RobotState:
+        """Assemble the state that a step led to, from positions `before` it and after it."""
+        return RobotState(qpos, qvel, (qpos[..., 0] - before[..., 0]) / self.time_step)
 
 
 def _mass_sets(train: tuple[float, ...], low: tuple[float, ...], high: tuple[float, ...]):
@@ -337,10 +331,8 @@ class HalfCheetahTask(Task):
 
     def preprocess(self, obs: Obs) -> Float[Array, "*batch features"]:
         """Return z, sin pitch, cos pitch, then the joint angles and all velocities."""
-        pitch = obs[..., 2:3]
-        return jnp.concatenate(
-            [obs[..., 1:2], jnp.sin(pitch), jnp.cos(pitch), obs[..., 3:]], axis=-1
-        )
+        height, pitch, others = obs[..., 1:2], obs[..., 2:3], obs[..., 3:]
+        return jnp.concatenate([height, jnp.sin(pitch), jnp.cos(pitch), others], axis=-1)
 
     def target(self, obs: Obs, next_obs: Obs) -> Obs:
         """Differences, and the average velocity itself."""

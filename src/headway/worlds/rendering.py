@@ -163,15 +163,18 @@ class RobotRenderer:
 
         model.vis.global_.offwidth, model.vis.global_.offheight = WIDTH, HEIGHT
         library = opengl_library()
-        name = f"mujoco.{library}" if library in ("egl", "osmesa") else "mujoco.gl_context"
         try:
-            self._context = importlib.import_module(name).GLContext(WIDTH, HEIGHT)
+            self._context = importlib.import_module(f"mujoco.{library}").GLContext(WIDTH, HEIGHT)
             self._context.make_current()
             size = mujoco.mjtFontScale.mjFONTSCALE_100.value
             self._mjr = mujoco.MjrContext(model, size)
         except Exception as error:  # each library fails with errors of its own
             reason = f"{type(error).__name__} {error}".splitlines()[0]
-            raise _no_opengl(f"{library} failed ({reason})") from error
+            raise BadEnvironmentError(
+                f"cannot draw without a screen: {library} failed ({reason}); on Debian, `apt-get"
+                " install libegl1 libgl1` (or libosmesa6), and leave MUJOCO_GL unset or set it to"
+                " egl or osmesa."
+            ) from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._mjr)
         self._scene = mujoco.MjvScene(model, maxgeom=1000)
         self._options, self._view = mujoco.MjvOption(), mujoco.MjvCamera()
@@ -190,10 +193,8 @@ class RobotRenderer:
         data.light_xpos[:, 2] = 4.0
         self._view.lookat[:] = torso[0], torso[1], self._height
         self._context.make_current()
-        everything = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(
-            model, data, self._options, None, self._view, everything, self._scene
-        )
+        view = self._options, None, self._view, mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(model, data, *view, self._scene)
         window = mujoco.MjrRect(0, 0, WIDTH, HEIGHT)
         mujoco.mjr_render(window, self._scene, self._mjr)
         pixels = np.empty((HEIGHT, WIDTH, 3), np.uint8)
@@ -208,22 +209,8 @@ class RobotRenderer:
 
 
 def opengl_library() -> str:
-    """Return the OpenGL library to draw with: `"egl"`, `"osmesa"` or MuJoCo's choice.
-
-    Raises:
-        BadEnvironmentError: None is installed.
-    """
+    """Return the OpenGL library to draw with: `"egl"`, `"osmesa"` or MuJoCo's own choice."""
     chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
-    if chosen or not sys.platform.startswith("linux"):
-        return chosen or "default"
-    for name in ("EGL", "OSMesa"):
-        if ctypes.util.find_library(name):
-            return name.lower()
-    raise _no_opengl("neither EGL nor OSMesa is installed")
-
-
-def _no_opengl(reason: str) -> BadEnvironmentError:
-    return BadEnvironmentError(
-        f"cannot draw without a screen: {reason}; on Debian, `apt-get install libegl1 libgl1` (or"
-        " libosmesa6), and leave MUJOCO_GL unset or set it to egl or osmesa."
-    )
+    if not chosen and sys.platform.startswith("linux"):
+        return "egl" if ctypes.util.find_library("EGL") else "osmesa"
+    return chosen if chosen in ("egl", "osmesa") else "gl_context"
