@@ -1,6 +1,5 @@
 """Promises of every environment."""
 
-import gymnasium
 import numpy as np
 import pytest
 from env_helpers import NAMES, ROBOTS, actions_of, all_physics, record
@@ -43,11 +42,7 @@ def test_spaces_and_names(name, env):
     np.testing.assert_array_equal(env.action_space.high, np.float32(task.action_high))
     assert env.reset(seed=0)[0] in env.observation_space
     assert env_spec(spec.env_id) is spec
-    by_id = gymnasium.make(spec.env_id, max_episode_steps=3)
-    by_id.reset(seed=0)
-    ends = [by_id.step(by_id.action_space.sample())[2:4] for _ in range(3)]
-    assert ends == [(False, False), (False, False), (False, True)]
-    assert env.spec.max_episode_steps == spec.episode_length
+    assert (env.spec.id, env.spec.max_episode_steps) == (spec.env_id, spec.episode_length)
 
 
 def test_sim_params_are_drawn_from_the_training_values(env, name):
@@ -90,9 +85,8 @@ def test_every_sim_param_changes_the_future(env, name):
             env.reset(seed=0, options={"sim_params": {**defaults, key: value}})
             world.set_state(start)
             ends.append(np.array([env.step(action)[0] for action in actions]))
-        for i, end in enumerate(ends):
-            for other in ends[:i]:
-                assert np.abs(end - other).max() > 1e-4
+        gaps = np.abs(np.array(ends)[:, None] - ends).max((2, 3))
+        assert gaps[~np.eye(len(ends), dtype=bool)].min() > 1e-4
 
 
 def test_state_round_trip(env, name):
