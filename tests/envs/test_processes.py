@@ -125,14 +125,6 @@ def test_what_an_environment_raises_arrives_and_its_process_goes_on(how, says, m
         vector.step(ONES)
     assert np.isfinite(vector.reset(seed=0)[0]).all()  # nobody's answer is left over
     assert pids(vector) == before
-
-
-def test_what_cannot_be_made_is_told_at_once(made):
-    def broken():
-        raise FileNotFoundError("no such robot")
-
-    with pytest.raises(FileNotFoundError, match="no such robot"):
-        ProcessVectorEnv([broken], step_timeout_s=1.0)
     with pytest.raises(ConfigError, match="step_timeout_s"):
         made(timeout_s=0.0)
 
