@@ -158,7 +158,7 @@ def test_episodes_that_end_early_and_other_kinds_of_numbers_are_learned_from(
 ):
     """Whole numbers are numbers; and one transition is an episode, to learn from and to test."""
     drift(how, at=at, **named)
-    run = train_run(config(**{"collection.num_episodes": 4}), tmp_path / "run")
+    run = train_run(config(), tmp_path / "run")
     data = run.load_data()
     assert {len(t) for t in data} == lengths
     assert {row.length for row in run.evaluation()} == lengths
