@@ -328,32 +328,27 @@ class _ValidityFilter:
         return np.where(bad.reshape(-1, *[1] * (values.ndim - 1)), instead, values)
 
 
+@dataclasses.dataclass
 class Batches:
-    """Runs batches of episodes; keeps what is finished, and stops where too many are invalid.
+    """Runs batches of episodes; keeps what is finished, and stops where too many are invalid."""
 
-    Args:
-        environments: Where they are run.
-        config: Settings of the run.
-        phase: `collection` or `evaluation`: whose setting `max_bad_episodes` holds.
-        on_step: Called with the number of environments that stepped.
-        say: Shows a line.
-        partial: Keeps finished batches, for when the process is killed.
-    """
+    environments: Environments
+    config: Config
+    phase: Literal["collection", "evaluation"]
+    """Whose setting `max_bad_episodes` holds."""
+    on_step: Callable[[int], None]
+    """Called with the number of environments that stepped."""
+    say: Callable[[str], None]
+    """Shows a line."""
+    partial: Partial | None = None
+    """Keeps finished batches, for when the process is killed."""
+    reasons: list[str] = dataclasses.field(default_factory=list)
+    """Why episodes were left out so far."""
 
-    def __init__(
-        self,
-        environments: Environments,
-        config: Config,
-        phase: Literal["collection", "evaluation"],
-        on_step: Callable[[int], None],
-        say: Callable[[str], None],
-        partial: Partial | None = None,
-    ):
-        self.environments, self.config, self.partial = environments, config, partial
-        self._setting = f"{phase}.max_bad_episodes"
-        self._allowed = getattr(config, phase).max_bad_episodes
-        self._on_step, self._say = on_step, say
-        self._reasons: list[str] = []
+    @property
+    def allowed(self) -> int:
+        """Most episodes that may be left out."""
+        return getattr(self.config, self.phase).max_bad_episodes
 
     def run(self, name: str, episodes: Sequence[Episode], policy: Callable[[], Policy]) -> Rollout:
         """Run a batch, unless it was finished before.
@@ -368,15 +363,15 @@ class Batches:
         """
         kept = self.partial.load(name) if self.partial else None
         if kept is None:
-            rollout = run_episodes(self.environments, episodes, policy(), self._on_step)
+            rollout = run_episodes(self.environments, episodes, policy(), self.on_step)
         else:
             rollout = Rollout.from_part(*kept)
-            self._on_step(len(episodes) * self.environments.episode_length)
-        self._reasons += rollout.invalid.values()
-        if len(self._reasons) > self._allowed:
+            self.on_step(len(episodes) * self.environments.episode_length)
+        self.reasons += rollout.invalid.values()
+        if len(self.reasons) > self.allowed:
             raise self.too_many()
         for reason in rollout.invalid.values():
-            self._say(f"{reason}; the episode is dropped.")
+            self.say(f"{reason}; the episode is dropped.")
         if self.partial and kept is None and rollout.episodes:
             self.partial.save(name, *rollout.to_part())
         return rollout
@@ -384,7 +379,8 @@ class Batches:
     def too_many(self) -> BadEnvironmentError:
         """Word the error for more invalid episodes than allowed, or for nothing else."""
         return BadEnvironmentError(
-            f"{len(self._reasons)} episodes broke, allowed: {self._allowed} ({self._setting}), and"
-            f" not all; the first: {self._reasons[0]}. Mend the environment under these physics, or"
+            f"{len(self.reasons)} episodes broke, allowed: {self.allowed}"
+            f" ({self.phase}.max_bad_episodes), and not all; the first: {self.reasons[0]}. Mend"
+            " the environment under these physics, or"
             " allow more; then the same command goes on."
         )
