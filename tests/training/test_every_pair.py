@@ -19,7 +19,6 @@ TINY = {
     "evaluation.num_episodes": 1,
 }
 DEFAULT = {
-    ("tmcl", "cartpole-swingup"),
     ("tmcl-bayes", "half-cheetah"),
     ("stacked", "pendulum"),
     ("cadm", "pendulum"),
