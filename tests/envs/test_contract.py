@@ -102,11 +102,9 @@ def test_state_round_trip(env, name):
     np.testing.assert_array_equal(*futures)
 
 
-@pytest.mark.parametrize("value", [-0.5, np.nan, np.inf, "heavy", None])
-def test_bad_values_are_refused(env, name, value):
+def test_bad_values_are_refused(env, name):
     key = next(iter(env_spec(name).default_sim_params))
-    edge = 4.0 if name == "crippled-ant" else 0.0
-    for bad in (value, edge):
+    for bad in (-0.5, np.nan, np.inf, "heavy", None, 4.0 if name == "crippled-ant" else 0.0):
         with pytest.raises(ConfigError, match="allowed") as caught:
             env.reset(options={"sim_params": {key: bad}})
         assert "\n" not in str(caught.value)

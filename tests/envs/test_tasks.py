@@ -8,9 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from env_helpers import NAMES, actions_of, all_physics, record
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from headway import envs
 from headway.errors import ConfigError, UnknownNameError
@@ -58,17 +55,11 @@ def test_termination_is_what_the_environment_said():
 
 
 @pytest.mark.parametrize("name", TASKS)
-@given(data=st.data())
-def test_postprocess_undoes_target(name, data):
-    task = TASKS[name]
-    numbers = st.floats(-100, 100, width=32)
-    obs, next_obs = (
-        data.draw(arrays(np.float32, (2, task.obs_size), elements=numbers)) for _ in range(2)
-    )
-    delta = task.target(jnp.asarray(obs), jnp.asarray(next_obs))
-    np.testing.assert_allclose(
-        task.postprocess(jnp.asarray(obs), delta), next_obs, rtol=1e-5, atol=1e-4
-    )
+def test_postprocess_undoes_target(name):
+    task, rng = TASKS[name], np.random.default_rng(0)
+    obs, next_obs = jnp.asarray(rng.uniform(-100, 100, (2, 50, task.obs_size)), jnp.float32)
+    again = task.postprocess(obs, task.target(obs, next_obs))
+    np.testing.assert_allclose(again, next_obs, rtol=1e-5, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", TASKS)

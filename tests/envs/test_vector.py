@@ -102,8 +102,11 @@ def test_bad_arguments_are_refused():
             envs.make_vec("pendulum", **arguments)
     with pytest.raises(UnknownNameError, match="Did you mean 'scale_inertia'"):
         envs.make_vec("hopper", 1, options={"scale_inertias": True})
-    separate = [lambda: gymnasium.make("Pendulum-v1")] * 2
-    for vector in (SequentialVectorEnv(separate), envs.make_vec("pendulum", 2)):
+    foreign = SequentialVectorEnv([lambda: gymnasium.make("Pendulum-v1")] * 2)
+    foreign.reset(options={"schedule": {0: {"length": 1.0}}})
+    with pytest.raises(ConfigError, match="no method set_sim_params"):
+        foreign.step(np.zeros((2, 1), np.float32))
+    for vector in (foreign, envs.make_vec("pendulum", 2)):
         vector.reset(seed=0)
         for shape in ((3, 1), (1, 1), (2,), ()):
             with pytest.raises(ConfigError, match="action"):
@@ -203,10 +206,3 @@ def test_a_schedule_changes_the_physics_at_its_step_of_its_environment_only(name
     one.reset(seed=7, options={"sim_params": before, "schedule": {3: change}})
     alone = np.stack([one.step(action)[0] for action in actions[:, 0]])
     np.testing.assert_array_equal(alone, runs[1][:, 0])
-
-
-def test_environments_of_ones_own_that_cannot_change_say_so():
-    plain = SequentialVectorEnv([lambda: gymnasium.make("Pendulum-v1")])
-    plain.reset(options={"schedule": {0: {"length": 1.0}}})
-    with pytest.raises(ConfigError, match="set_sim_params"):
-        plain.step(np.zeros((1, 1), np.float32))
