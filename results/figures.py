@@ -115,12 +115,19 @@ def two_panels(
     shared = table.groupby("arm").method.nunique() == len(methods)
     arms = [arm for arm in table.arm.unique() if shared[arm]]
     looks = {arm: {"color": color} for arm, color in zip(arms, COLORS, strict=False)}
+    names = {"none": "frozen heads", "last-layer": "heads that learn"}
+    marks = {"marker": "o", "linestyle": ""}
     caption = (
         "A dot is one run, a bar the mean over runs. Same trained models and same episodes for"
         " all arms; no number was chosen on unseen physics."
     )
-    size = (8.0, 1.9 + 0.45 * len(methods))
-    with figures.figure(figure, title=title, caption=caption, size=size) as drawing:
+    with figures.figure(
+        figure,
+        title=title,
+        caption=caption,
+        size=(8.0, 1.9 + 0.45 * len(methods)),
+        looks={names.get(arm, arm): {**looks[arm], **marks} for arm in arms},
+    ) as drawing:
         for axes, panel in zip(drawing.subplots(1, 2, sharey=True), panels, strict=True):
             for row, method in enumerate(methods):
                 for place, arm in enumerate(arms):
@@ -131,9 +138,6 @@ def two_panels(
             axes.set_yticks(range(len(methods)), methods)
             axes.set_ylim(len(methods) - 0.5, -0.5)
             figures.numbers(axes, x=value.format(panel))
-        names = {"none": "frozen heads", "last-layer": "heads that learn"}
-        marks = {"marker": "o", "linestyle": ""}
-        figures.legend(drawing, {names.get(arm, arm): {**looks[arm], **marks} for arm in arms})
 
 
 def arms(folder: Path, figure: Path | None, reference: Path | None) -> None:

@@ -2,11 +2,9 @@
 
 import json
 
-from headway.config import to_dict
-from headway.training.files import write_json
 from headway.training.methods import make_config
 from headway.training.progress import Progress
-from headway.training.run import SCHEMA, RunDir
+from headway.training.run import RunDir
 
 TINY = {
     "collection.episode_length": 12,
@@ -47,22 +45,3 @@ def result(path):
         if not name.startswith(("figures", "config.json"))
     }
     return untimed, kept
-
-
-def write_run(path, config, metrics, tables):
-    """Write a run that was never trained.
-
-    Args:
-        path: The run directory.
-        config: Its settings.
-        metrics: Lines of `metrics.jsonl`.
-        tables: Rows of the other tables, by file name.
-    """
-    write_json(path / "config.json", {"schema": SCHEMA, "config": to_dict(config)})
-    for line in metrics:
-        own = {
-            name: [row for row in rows if row["iteration"] == line["iteration"]]
-            for name, rows in tables.items()
-        }
-        RunDir(path).save_iteration(line, (), [], {}, own)
-    return path

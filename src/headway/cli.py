@@ -90,7 +90,8 @@ class Command:
             return 0
         from rich.console import Console
 
-        console = Console(width=None if sys.stdout.isatty() else PIPE_WIDTH, highlight=False)
+        width = None if sys.stdout.isatty() else PIPE_WIDTH
+        console = Console(width=width, highlight=False, markup=False, emoji=False)
         for table in tables:
             if isinstance(table, str):
                 print(table)
@@ -195,19 +196,20 @@ class Train(Command):
         )
         rows = run.last_tests
         drawn = [str(path) for path in figures.save_run_figures(run.path)]
+        title = f"{run.config.env}, {run.config.method} after {len(run.metrics)} iterations"
+        tested, table = tables.evaluation(rows, run.config, title)
         facts = {
             "run_dir": str(run.path),
             **{name: getattr(run.config, name) for name in ("env", "method", "preset", "seed")},
             "iterations": len(run.metrics),
             "timesteps": run.metrics[-1]["timesteps"],
-            **tables.evaluation_facts(rows, run.config),
+            **tested,
             "figures": drawn,
         }
-        title = f"{run.config.env}, {run.config.method} after {len(run.metrics)} iterations"
         again = shlex.join(["headway", *words])
         return self.show(
             facts,
-            tables.evaluation(rows, run.config, title),
+            table,
             "\n  ".join(["Figures:", *drawn]),
             f"Test it again:\n  {shlex.join(['headway', 'evaluate', str(run.path)])}",
             f"The command, which resumes what was interrupted:\n  {again}",
@@ -263,17 +265,17 @@ class Evaluate(_OfRun):
             settings=settings,
             progress=self.progress(),
         )
-        cost, config = found.cost, found.config
+        cost = found.cost
+        tested, table = tables.evaluation(found, found.config, str(self.run_dir))
         facts = {
             "run_dir": str(self.run_dir),
             "settings": settings,
             "planning": dataclasses.asdict(cost),
-            **tables.evaluation_facts(found, config),
+            **tested,
         }
         took = f"{cost.evaluations_per_step:,.0f} candidates, {cost.flop_per_step / 1e9:.3g} GFLOP"
         if cost.seconds_per_step is not None:
             took += f", {1e3 * cost.seconds_per_step:.3g} ms"
-        table = tables.evaluation(found, config, str(self.run_dir))
         return self.show(facts, table, f"Planning took {took} per step.")
 
 
@@ -418,14 +420,15 @@ class _Runs(Command):
 
             entries, table = states(comparison)
             return self.show({"runs": entries}, table)
-        from headway.lab.comparison import reproduce, results
+        from rich.markdown import Markdown
 
-        command = shlex.join(["headway", *words])
+        from headway.lab.comparison import reproduce
+
         done = reproduce(
             comparison,
             workers=Workers(self.one_by_one, self.address, self.cpus_per_run, self.gpus_per_run),
             quiet=self.quiet,
-            command=command,
+            command=shlex.join(["headway", *words]),
         )
         for path, reason in done.failures.items():
             print(f"failed: {path}: {reason}", file=sys.stderr)
@@ -433,15 +436,11 @@ class _Runs(Command):
             "experiment": comparison.experiment.name,
             "runs": len(comparison.jobs),
             "failures": {str(path): reason for path, reason in done.failures.items()},
-            "returns": done.found.last.to_dict("records"),
+            "returns": done.last.to_dict("records"),
             "files": [str(path) for path in done.files],
         }
-        self.show(
-            facts,
-            *results(done.found),
-            "\n  ".join(["Written:", *map(str, done.files)]),
-            f"The command, which resumes what was interrupted:\n  {command}",
-        )
+        written = "\n  ".join(["Written:", *map(str, done.files)])
+        self.show(facts, Markdown(done.files[-1].read_text()), written)
         return 1 if done.failures else 0
 
 

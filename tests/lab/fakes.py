@@ -1,29 +1,33 @@
 """Runs that are small, or that are written instead of trained."""
 
+import itertools
+import json
+
 import numpy as np
 
-import runs
+from headway.config import to_dict
 from headway.errors import DivergenceError
-from headway.lab.sweep import Job
+from headway.lab.paper import experiment
+from headway.lab.sweep import Comparison, Job
 from headway.task import sim_param_sets
-from headway.training.methods import make_config
-from headway.training.run import EpisodeRow
+from headway.training.files import write_json
+from headway.training.methods import METHODS, make_config
+from headway.training.run import SCHEMA, EpisodeRow, RunDir, format_sim_params
 
-TINY = {
-    "collection.episode_length": 6,
-    "collection.num_iterations": 2,
-    "fitting.epochs": 1,
-    "model.hidden_sizes": [8, 8],
-    "model.context_hidden_sizes": [8],
-    "planner.num_candidates": 8,
-    "planner.horizon": 3,
-}
+LEVELS = {"train": -190.0, "low": -620.0, "high": -330.0, "collected": -300.0}
+LIFTS = {"tmcl": 0.0, "pets": -150.0, "random": -900.0, "true-dynamics": 300.0}
 DIVERGED = DivergenceError("no finite number")
 
 
-def tiny_job(out, seed=0, **changes):
-    config = make_config("pendulum", preset="smoke", seed=seed, settings={**TINY, **changes})
-    return Job.of(config, out)
+def random_job(out, seed=0, **settings):
+    """A run that learns nothing, so that nothing is compiled."""
+    names = {"method": "random", "preset": "smoke", "seed": seed}
+    return Job.of(make_config("pendulum", **names, settings=settings), out)
+
+
+def comparison(out, name="fig13", envs=("pendulum",), seeds=(0,), preset="smoke", **settings):
+    asked = experiment(name) if isinstance(name, str) else name
+    return Comparison(asked, envs, seeds, preset, out, settings)
 
 
 class FakeTraining:
@@ -40,7 +44,7 @@ class FakeTraining:
             if errors := self.answers.get(job.config.seed):
                 failures[job.path] = str(errors.pop(0))
             else:
-                write_run(job.config, job.path)
+                write_level(job.path, job.config)
         return failures
 
 
@@ -49,31 +53,78 @@ def level(config, iteration):
     return 10.0 * len(config.method) + config.seed + iteration
 
 
-def write_run(config, path, keep=None):
-    """Write the files that reports read; with the tests of all iterations, or of one."""
-    sets = sim_param_sets(config)
-    lines, rows = [], []
+def write_level(path, config):
+    """Write a run with two episodes per group, on training physics with returns 100 higher."""
+
+    def returns(iteration, group):
+        mean = level(config, iteration) + 100.0 * (group == "train")
+        return np.array([mean - 1, mean + 1])
+
+    return write_run(path, config, returns)
+
+
+def write(path, method="tmcl", *, seed=0, lift=0.0, env=None, iterations=5, heads=3, **settings):
+    """Write a quick run on Pendulum, perhaps under a name that is nobody's.
+
+    Its returns are the same for every method, but for the lift.
+    """
+
+    def returns(iteration, group):
+        rng = np.random.default_rng([seed, iteration, len(group)])
+        return rng.normal(LEVELS[group], 100, 8) + lift * (group != "collected")
+
+    config = make_config(
+        "pendulum",
+        method=method if method in METHODS else "tmcl",
+        preset="quick",
+        seed=seed,
+        settings={"collection.num_iterations": iterations, **settings},
+    )
+    write_run(path, config, returns, heads)
+    content = json.loads((path / "config.json").read_bytes())
+    content["config"] |= {"env": env or "pendulum", "method": method}
+    write_json(path / "config.json", content)
+    return path
+
+
+def write_run(path, config, returns, heads=3):
+    """Write what a run leaves behind, with returns by iteration and group."""
+    write_json(path / "config.json", {"schema": SCHEMA, "config": to_dict(config), "device": "cpu"})
+    sets, rng = sim_param_sets(config), np.random.default_rng(config.seed)
+    train = [format_sim_params(physics) for physics in sets.group("train")]
     for i in range(config.collection.num_iterations):
-        returns = [level(config, i) - 1, level(config, i) + 1]
+        tested = {group: returns(i, group) for group in sets.group_names}
+        run = config.method, config.env, config.seed, i
+        shares = rng.dirichlet(np.ones(heads), (5, len(train)))
+        tables = {
+            "evaluation.csv": [
+                EpisodeRow(*run, group, physics, episode, value, 200).to_csv()
+                for group, values in tested.items()
+                for episode, (value, physics) in enumerate(
+                    zip(values, itertools.cycle(sets.group(group)), strict=False)
+                )
+            ],
+            "assignments.csv": [
+                {"iteration": i, "member": m, "head": h, "sim_params": train[k], "share": share}
+                for (m, k, h), share in np.ndenumerate(shares)
+            ],
+            "prediction_error.csv": [
+                {"iteration": i, "group": group, "step": step, "error": scale * step / 10}
+                for group, scale in zip(tested, (0.3, 0.9, 0.6), strict=True)
+                for step in range(1, 21)
+            ],
+        }
         metrics = {
             "iteration": i,
-            "timesteps": 20 * (i + 1),
-            "collection": {
-                "returns": returns, "return_mean": float(np.mean(returns)), "return_std": 1.0
-            },
-            "fitting": {"loss": 1.0},
-            "evaluation": {},
-            "seconds": {"collect": 1.0, "fit": 2.0, "evaluate": 1.0},
-        }  # fmt: skip
-        lines.append(metrics)
-        for group in sets.group_names:
-            shift = 100.0 if group == "train" else 0.0
-            rows += [
-                EpisodeRow(
-                    config.method, config.env, config.seed, i, group,
-                    dict(sets.group(group)[0]), episode, value + shift, 20,
-                )
-                for episode, value in enumerate(returns)
-            ]  # fmt: skip
-    kept = [row.to_csv() for row in rows if keep is None or row.iteration == keep]
-    runs.write_run(path, config, lines, {"evaluation.csv": kept})
+            "timesteps": 1000 * (i + 1),
+            "collection": _summary(returns(i, "collected")),
+            "evaluation": {group: _summary(values) for group, values in tested.items()},
+            "seconds": {"collect": 60.0, "fit": 30.0, "evaluate": 6.0},
+        }
+        RunDir(path).save_iteration(metrics, (), [], {}, tables)
+    return path
+
+
+def _summary(returns):
+    mean, std = float(returns.mean()), float(returns.std())
+    return {"returns": returns.tolist(), "return_mean": mean, "return_std": std}

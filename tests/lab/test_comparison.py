@@ -10,15 +10,17 @@ import pytest
 from PIL import Image
 
 from headway.errors import RunError
-from headway.lab.comparison import find, reproduce, spread, table_rows, verdicts
-from headway.lab.paper import Arm, Experiment, experiment
-from headway.lab.sweep import Comparison, Workers
+from headway.lab.comparison import draw, find, reproduce, table, verdicts
+from headway.lab.paper import Arm, Experiment, sweep_experiment
+from headway.lab.sweep import Workers
 
-HERE = Workers(one_by_one=True)
+HERE, THREE = Workers(one_by_one=True), (0, 1, 2)
 
 
-def comparison(out, name="fig13", seeds=(0, 1, 2), envs=("pendulum",), **settings):
-    return Comparison(experiment(name), envs, seeds, "smoke", out, settings)
+def compare(out, name="fig13", seeds=(0,), command="", **asked):
+    return reproduce(
+        fakes.comparison(out, name, seeds=seeds, **asked), workers=HERE, command=command
+    )
 
 
 def rows_of(path):
@@ -27,7 +29,7 @@ def rows_of(path):
 
 
 def test_files_stand_beside_each_other_and_hold_what_the_runs_say(training, tmp_path):
-    done = reproduce(comparison(tmp_path), workers=HERE, command="headway reproduce fig13")
+    done = compare(tmp_path, seeds=THREE, command="headway reproduce fig13")
     folder = tmp_path / "fig13-smoke"
     assert sorted(path.name for path in done.files) == [
         "fig13.csv", "fig13.md", "fig13.png", "fig13.svg"
@@ -44,23 +46,23 @@ def test_files_stand_beside_each_other_and_hold_what_the_runs_say(training, tmp_
     ]
     assert np.mean(unseen) == 30 + 2 + 1  # see fakes.level
     assert all((tmp_path / row["run"] / "config.json").exists() for row in rows)
-    table = (folder / "fig13.md").read_text()
+    text = (folder / "fig13.md").read_text()
     spread_of_three = r"32.0 \(3[1-3][.\d]* to 3[1-3][.\d]*\)"
     assert re.search(
-        rf"\| MCL \| 3 \| 32.0 ± 1.0 \| {spread_of_three} \| 132.0 ± 1.0 \| – \|", table
+        rf"\| MCL \| 3 \| 32.0 ± 1.0 \| {spread_of_three} \| 132.0 ± 1.0 \| – \|", text
     )
-    assert "| T-MCL | 3 | 42.0 ± 1.0 | 42.0 (4" in table
+    assert "| T-MCL | 3 | 42.0 ± 1.0 | 42.0 (4" in text
     # All of T-MCL's runs are above all of MCL's, which three seeds show by chance as well.
-    assert "- 3 seeds: too few to show that T-MCL and MCL differ (the clearest result has" in table
-    assert "; T-MCL is above MCL in every pair of runs." in table
-    assert "- Intervals from fewer than 10 seeds are too narrow" in table
-    assert "    headway reproduce fig13\n" in table
-    assert "no difference between arms can be claimed" not in table
+    assert "- 3 seeds: too few to show that T-MCL and MCL differ (the clearest result has" in text
+    assert "; T-MCL is above MCL in every pair of runs." in text
+    assert "- Intervals from fewer than 10 seeds are too narrow" in text
+    assert "    headway reproduce fig13\n" in text
+    assert "no difference between arms can be claimed" not in text
 
 
 def test_figures_have_ink_and_svg_names_the_arms(training, tmp_path):
     envs = ("pendulum", "hopper", "half-cheetah", "cartpole-swingup")
-    reproduce(comparison(tmp_path, envs=envs, seeds=(0, 1)), workers=HERE)
+    done = compare(tmp_path, envs=envs, seeds=(0, 1))
     png, svg = (tmp_path / "fig13-smoke" / f"fig13.{kind}" for kind in ("png", "svg"))
     pixels = np.asarray(Image.open(png).convert("L"))
     assert 0.005 < (pixels < 200).mean() < 0.6
@@ -68,46 +70,43 @@ def test_figures_have_ink_and_svg_names_the_arms(training, tmp_path):
     assert first.startswith(b"<?xml")
     assert first.count(b"<!-- T-MCL -->") == 1  # matplotlib names drawn texts in comments
     svg.unlink()
-    reproduce(comparison(tmp_path, envs=envs, seeds=(0, 1)), workers=HERE)
+    draw(done)
     assert svg.read_bytes() == first
 
 
 def test_training_curves_show_what_was_collected(training, tmp_path):
-    done = reproduce(comparison(tmp_path, "fig9", seeds=(0,)), workers=HERE)
+    done = compare(tmp_path, "fig9")
     rows = rows_of(tmp_path / "fig9-smoke/fig9.csv")
     assert {row["group"] for row in rows} == {"collected"}
-    points = done.found.points.query("label == 'T-MCL'")
+    points = done.points.query("label == 'T-MCL'")
     assert list(zip(points.iteration, points["return"], strict=True)) == [(0, 40.0), (1, 41.0)]
 
 
 def test_few_seeds_and_missing_runs_are_said(training, tmp_path):
     training.answers = {1: [fakes.DIVERGED]}
-    done = reproduce(comparison(tmp_path, seeds=(0, 1)), workers=HERE)
+    done = compare(tmp_path, seeds=(0, 1))
     assert len(done.failures) == 1
-    assert [tuple(cell) for cell in done.found.missing] == [("pendulum", "MCL", 1)]
-    table = (tmp_path / "fig13-smoke/fig13.md").read_text()
-    assert "is better than" not in table
-    assert "Fewer than 3 seeds: no difference between arms can be claimed." in table
-    assert "Not finished: pendulum, MCL, seed 1." in table
-    assert "| MCL | 1 | 31.0 | – | 131.0 | – |" in table
+    assert done.missing == [("pendulum", "MCL", 1)]
+    text = (tmp_path / "fig13-smoke/fig13.md").read_text()
+    assert "is better than" not in text
+    assert "Fewer than 3 seeds: no difference between arms can be claimed." in text
+    assert "Not finished: pendulum, MCL, seed 1." in text
+    assert "| MCL | 1 | 31.0 | – | 131.0 | – |" in text
 
 
 def test_arms_are_compared_over_groups_and_environments_of_both(training, tmp_path):
     training.answers = {0: [fakes.DIVERGED]}
-    done = reproduce(comparison(tmp_path, envs=("pendulum", "half-cheetah")), workers=HERE)
-    assert [tuple(cell) for cell in done.found.missing] == [("pendulum", "MCL", 0)]
-    parts = done.found.parts.query("env == 'pendulum' and label == 'MCL' and group == 'low'")
-    assert dict(zip(parts.seed, parts.return_mean, strict=True)) == {1: 32, 2: 33}
-    (line,) = verdicts(done.found)
+    done = compare(tmp_path, envs=("pendulum", "half-cheetah"), seeds=THREE)
+    assert done.missing == [("pendulum", "MCL", 0)]
+    parts = done.parts.query("env == 'pendulum' and label == 'MCL' and group == 'low'")
+    assert parts.groupby("seed").return_mean.mean().to_dict() == {1: 32, 2: 33}
+    (line,) = verdicts(done)
     assert line.startswith("2 seeds: too few to show that T-MCL and MCL differ")
 
 
 def test_arms_that_were_not_tested_alike_are_not_compared(training, tmp_path):
     arms = (Arm("short"), Arm("long", settings={"collection.episode_length": 30}))
-    asked = Comparison(
-        Experiment("own", "lengths", arms), ("pendulum",), (0, 1, 2), "smoke", tmp_path
-    )
-    lines = verdicts(reproduce(asked, workers=HERE).found)
+    lines = verdicts(compare(tmp_path, Experiment("own", "lengths", arms), seeds=THREE))
     assert lines == [
         "Not compared with short, because physics, episode lengths or options of the environment"
         " differ: long on pendulum."
@@ -115,7 +114,7 @@ def test_arms_that_were_not_tested_alike_are_not_compared(training, tmp_path):
 
 
 def test_physics_count_once_however_many_episodes_they_have(training, tmp_path):
-    found = reproduce(comparison(tmp_path, seeds=(0,)), workers=HERE).found
+    found = compare(tmp_path)
     rows = found.episodes.query("label == 'T-MCL' and group == 'low' and iteration == 1")
     rows = rows.iloc[[0, 0, 0]].assign(**{
         "sim_params": ["length=0.25 mass=1", "length=0.375 mass=1", "length=0.375 mass=1"],
@@ -125,20 +124,10 @@ def test_physics_count_once_however_many_episodes_they_have(training, tmp_path):
     assert point == 3.5
 
 
-def test_another_figure_reuses_the_runs(training, tmp_path):
-    reproduce(comparison(tmp_path, seeds=(0,)), workers=HERE)
-    before = len(training.calls)
-    done = reproduce(comparison(tmp_path, "fig15", seeds=(0,)), workers=HERE)
-    assert (before, len(training.calls)) == (2, 2 + 3)
-    assert len(done.found.last) == 5
-
-
 @pytest.mark.usefixtures("training", "without_figures")
 def test_a_comparison_replaces_what_it_contains_and_nothing_else(tmp_path):
     def make(**changes):
-        options = {"seeds": (0,), **changes}
-        done = reproduce(comparison(tmp_path, **options), workers=HERE)
-        return done.files[-1].parent
+        return compare(tmp_path, **changes).files[-1].parent
 
     usual = make()
     assert make() == make(seeds=(0, 1)) == make(seeds=(1, 0), envs=("hopper", "pendulum")) == usual
@@ -149,6 +138,11 @@ def test_a_comparison_replaces_what_it_contains_and_nothing_else(tmp_path):
     assert len({usual, other, make(envs=("slim-humanoid",)), make(**horizon)}) == 4
     assert make(envs=("hopper",)) == other
     assert (usual / "fig13.csv").read_bytes() == both
+    own = [
+        make(name=sweep_experiment("own", methods, {}))
+        for methods in (["pets"], ["pets", "tmcl"], ["mcl"])
+    ]
+    assert own[0] == own[1] != own[2]
     (usual / "comparison.json").write_text("{}")
     assert make(seeds=(0, 1), envs=("pendulum", "hopper")) != usual
     for damaged in ("{", "[1]"):
@@ -159,23 +153,17 @@ def test_a_comparison_replaces_what_it_contains_and_nothing_else(tmp_path):
 
 def test_nothing_finished_makes_no_figure_but_a_table(training, tmp_path):
     training.answers = {0: [fakes.DIVERGED] * 2}
-    done = reproduce(comparison(tmp_path, seeds=(0,)), workers=HERE)
+    done = compare(tmp_path)
     assert [path.suffix for path in done.files] == [".csv", ".md"]
-    assert len(find(comparison(tmp_path, seeds=(0,))).missing) == 2
+    assert len(find(fakes.comparison(tmp_path)).missing) == 2
     assert "| MCL | 0 | – | – | – | – |" in done.files[-1].read_text()
-
-
-def test_spread_is_over_seeds():
-    assert spread([]) == "–"
-    assert spread([1234.5]) == "1,234.5"
-    assert spread([1.0, 3.0]) == "2.0 ± 1.4"
 
 
 def test_arms_stand_in_the_order_of_results_beside_their_scores(training, tmp_path):
     changed = {"collection.num_iterations": 1, "collection.episode_length": 200}
-    done = reproduce(comparison(tmp_path, **changed), workers=HERE)
+    done = compare(tmp_path, seeds=THREE, **changed)
     drawn = (tmp_path / "fig13-smoke/fig13.svg").read_text()
-    rows = table_rows(done.found, "pendulum")
+    rows = table(done, "pendulum")[1:]
     texts = ["T-MCL", "MCL", rows[1][-1], rows[0][-1], "score"]
     assert "–" not in texts
     assert all(f"<!-- {text.replace('-', '-')} -->" in drawn for text in texts)

@@ -2,6 +2,7 @@
 
 import json
 
+import fakes
 import matplotlib
 import numpy as np
 import pandas as pd
@@ -9,7 +10,6 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from headway.errors import RunError
 from headway.lab import figures
 from headway.lab.figures import save_run_figures
 from headway.lab.paper import Arm, experiment, sweep_experiment
@@ -45,60 +45,48 @@ def test_a_missing_file_leaves_its_figure_out(run_dir, missing, figure):
     assert names == [name for name in ALL if name != figure]
 
 
-def test_one_iteration_one_head_diverged_predictions(tmp_path, write_run):
-    path = write_run(tmp_path / "run", iterations=1, heads=1)
+def test_one_iteration_one_head_diverged_predictions(tmp_path):
+    path = fakes.write(tmp_path / "run", iterations=1, heads=1)
     table = path / "prediction_error.csv"
     table.write_text(table.read_text() + "0,low,21,1e6\n0,low,22,nan\n0,far,1,inf\n")
-    lines = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
-    for line in lines:
-        line.pop("evaluation")
-    (path / "metrics.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    (line,) = (path / "metrics.jsonl").read_text().splitlines()
+    (path / "metrics.jsonl").write_text(json.dumps(json.loads(line) | {"evaluation": {}}))
     names = [figure.name for figure in save_run_figures(path)]
     assert names == [name for name in ALL if name != "head_shares.png"]
 
 
-def test_no_figures_of_what_is_no_run(tmp_path):
-    with pytest.raises(RunError, match="not a directory"):
-        save_run_figures(tmp_path / "nothing")
-
-
-def curve_of(values, finished=True):
-    """Returns by seed and iteration, as `figures.curves` takes them."""
-    return pd.DataFrame(
+def drawn_curves(*values, finished=(True, True, True), steps=20):
+    """Axes with the curves of one label, from the returns of each seed by iteration."""
+    table = pd.DataFrame(
         [
-            {"label": "A", "run": str(seed), "iteration": i, "timesteps": 20 * i + 20 * (i < 9),
-             "return": value, "finished": finished}
+            {"label": "A", "run": str(seed), "iteration": i, "timesteps": steps * (i + 1),
+             "return": value, "finished": finished[seed]}
             for seed, returns in enumerate(values)
             for i, value in enumerate(returns)
         ]
     )  # fmt: skip
-
-
-def drawn_curves(table):
     axes = Figure().subplots()
     figures.curves(axes, table, {"A": figures.look(0)})
     return axes
 
 
 def test_curves_have_a_band_from_three_seeds_on():
-    two = drawn_curves(curve_of([[0, 10], [2, 12]]))
+    two = drawn_curves([0, 10], [2, 12])
     assert not two.collections
     assert len(two.get_lines()) == 3  # a thin line per seed
-    three = drawn_curves(curve_of([[0, 10], [2, 12], [4, 14]]))
+    three = drawn_curves([0, 10], [2, 12], [4, 14])
     assert len(three.collections) == 1
     (line,) = three.get_lines()
     assert list(line.get_ydata()) == [2, 12]
 
 
 def test_unfinished_runs_are_no_part_of_the_mean():
-    table = pd.concat([curve_of([[0, 10]]), curve_of([[99]], finished=False).assign(run="x")])
-    lines = drawn_curves(table).get_lines()
+    lines = drawn_curves([0, 10], [99], finished=(True, False)).get_lines()
     assert [list(line.get_ydata()) for line in lines] == [[99], [0, 10]]
 
 
 def test_what_learns_nothing_is_a_level():
-    axes = drawn_curves(curve_of([[5.0]]).assign(timesteps=0))
-    (line,) = axes.get_lines()
+    (line,) = drawn_curves([5.0], steps=0).get_lines()
     assert list(line.get_ydata()) == [5.0, 5.0]
 
 

@@ -7,6 +7,7 @@ import io
 import re
 import shutil
 
+import fakes
 import numpy as np
 import pytest
 from PIL import Image
@@ -18,7 +19,6 @@ CHAPTERS = [
     "results", "learning-curves", "physics", "improvement", "head-shares", "prediction-error",
     "settings", "times", "runs", "numbers",
 ]  # fmt: skip
-TABLES = ("metrics.jsonl", "evaluation.csv", "assignments.csv", "prediction_error.csv")
 CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "google-chrome"))), None
 )
@@ -38,17 +38,17 @@ def numbers(page):
     return list(csv.DictReader(io.StringIO(base64.b64decode(content).decode())))
 
 
+def report(root):
+    return write_report([root], root.parent / "report.html")
+
+
 @pytest.fixture(scope="module")
-def made(tmp_path_factory, write_run):
+def made(written, tmp_path_factory):
     """A page of two methods over three seeds with both references, and an unfinished run."""
-    root = tmp_path_factory.mktemp("report")
-    lifts = {"tmcl": 0.0, "pets": -150.0, "random": -900.0, "true-dynamics": 300.0}
-    for method, lift in lifts.items():
-        for seed in range(3):
-            write_run(root / f"runs/{method}-{seed}", method=method, seed=seed, lift=lift)
-    unfinished = write_run(root / "runs/tmcl-3", seed=3) / "metrics.jsonl"
+    root = shutil.copytree(written, tmp_path_factory.mktemp("report") / "runs")
+    unfinished = fakes.write(root / "tmcl-3", seed=3) / "metrics.jsonl"
     unfinished.write_text("".join(unfinished.read_text().splitlines(keepends=True)[:3]))
-    return write_report([root / "runs"], root / "report.html")
+    return report(root)
 
 
 def test_the_page_holds_every_chapter_and_needs_nothing_else(made):
@@ -80,54 +80,44 @@ def test_results_and_claims_are_those_of_the_numbers(made):
     assert "3 of 5 iterations are finished" in text_of(page)
 
 
-def test_few_seeds_have_no_interval_and_no_claim(tmp_path, write_run):
+def test_few_seeds_have_no_interval_and_no_claim(tmp_path):
     for method in ("tmcl", "pets"):
-        write_run(tmp_path / f"runs/{method}", method=method, lift=len(method))
-    page = write_report([tmp_path / "runs"], tmp_path / "report.html").read_text()
+        fakes.write(tmp_path / f"runs/{method}", method, lift=len(method))
+    page = report(tmp_path / "runs").read_text()
     results = text_of(section(page, "results"))
     assert "Fewer than 3 finished seeds: tmcl on pendulum (1); pets on pendulum (1)." in results
     assert not re.search(r"\d to [−\d]", results)
     assert "is better than" not in page
 
 
-def test_damage_costs_one_line_and_no_chapter(tmp_path, write_run):
-    for seed in (0, 1):
-        write_run(tmp_path / f"runs/tmcl-{seed}", seed=seed)
-    for name in TABLES:
-        (tmp_path / "runs/tmcl-1" / name).write_bytes(b"\xff no\n")
-    page = write_report([tmp_path / "runs"], tmp_path / "report.html").read_text()
-    notes = re.findall(r"<li><code>(.*?)</code> (.*?)</li>", page)
-    assert {run for run, _ in notes} == {str(tmp_path / "runs/tmcl-1")}
-    assert re.findall(r'<section id="([\w-]+)">', page) == CHAPTERS
-
-
-def test_nothing_finished_has_every_chapter(tmp_path, write_run):
-    path = write_run(tmp_path / "run")
-    for name in TABLES:
-        (path / name).unlink()
-    page = write_report([path], tmp_path / "report.html").read_text()
+def test_nothing_finished_has_every_chapter(run_dir):
+    for name in ("metrics.jsonl", "evaluation.csv", "assignments.csv", "prediction_error.csv"):
+        (run_dir / name).write_bytes(b"\xff no\n")
+    page = report(run_dir).read_text()
+    assert page.count(f"<li><code>{run_dir}</code>") == 5  # one for each, and what is missing
     assert "No run is finished yet." in page
     assert re.findall(r'<section id="([\w-]+)">', page) == CHAPTERS
     with pytest.raises(ConfigError, match="no run is given"):
-        write_report([], tmp_path / "report.html")
+        write_report([])
 
 
-def test_several_environments_are_taken_together(tmp_path, write_run):
+def test_several_environments_are_taken_together(tmp_path):
     for env in ("pendulum", "own"):
         for method in ("tmcl", "random", "true-dynamics"):
-            lift = {"random": -900, "true-dynamics": 300}.get(method, 0)
-            write_run(tmp_path / f"runs/{env}-{method}", env=env, method=method, lift=lift)
-    page = write_report([tmp_path / "runs"], tmp_path / "report.html").read_text()
+            fakes.write(
+                tmp_path / f"runs/{env}-{method}", method, env=env, lift=fakes.LIFTS[method]
+            )
+    page = report(tmp_path / "runs").read_text()
     assert "All environments" in section(page, "results")
     assert page.count("<h3>own</h3>") == page.count("<h3>pendulum</h3>") > 1
 
 
-def test_names_with_html_are_only_text(tmp_path, write_run):
-    path = write_run(tmp_path / "a<b>&'c", method=HOSTILE, env=HOSTILE)
+def test_names_with_html_are_only_text(tmp_path):
+    path = fakes.write(tmp_path / "a<b>&'c", HOSTILE, env=HOSTILE)
     for table in ("evaluation.csv", "prediction_error.csv"):
         text = (path / table).read_text().replace(",low,", ',"' + HOSTILE.replace('"', '""') + '",')
         (path / table).write_text(text)
-    page = write_report([path], tmp_path / "report.html").read_text()
+    page = report(path).read_text()
     assert "<script" not in page
     assert "<b>" not in page
     assert HOSTILE in html.unescape(page)

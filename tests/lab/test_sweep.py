@@ -4,31 +4,18 @@ import io
 import sys
 import threading
 
-import fakes
 import pytest
+from fakes import comparison, random_job, write_level
 
 from headway.config import override
 from headway.errors import ConfigError
-from headway.lab import sweep
-from headway.lab.paper import experiment, sweep_experiment
-from headway.lab.sweep import Comparison, Job, State, Workers, fingerprint, run_jobs
+from headway.lab.paper import sweep_experiment
+from headway.lab.sweep import Job, State, Workers, fingerprint, run_jobs
 from headway.training.methods import make_config
 from headway.training.run import RunDir
 from headway.training.train import train_run
 
 HERE = Workers(one_by_one=True)
-
-
-@pytest.fixture(autouse=True)
-def impatient(monkeypatch):
-    """Runs that were lost or are held are tried again soon."""
-    monkeypatch.setattr(sweep, "PATIENCE", 0.2)
-
-
-def random_job(out, seed=0):
-    """A run that learns nothing, and takes little time."""
-    config = make_config("pendulum", method="random", preset="smoke", seed=seed)
-    return Job.of(config, out)
 
 
 def test_a_directory_stands_for_all_settings_but_the_seed(tmp_path):
@@ -46,40 +33,38 @@ def test_a_directory_stands_for_all_settings_but_the_seed(tmp_path):
 
 
 def test_what_a_run_only_tolerates_does_not_separate_runs(tmp_path):
-    plain = make_config("pendulum", method="random", preset="smoke")
-    tolerant = override(plain, {"evaluation.max_bad_episodes": 1})
-    job, same = Job.of(plain, tmp_path), Job.of(tolerant, tmp_path)
+    job = random_job(tmp_path)
+    same = Job.of(override(job.config, {"evaluation.max_bad_episodes": 1}), tmp_path)
     assert same.path == job.path
     train_run(job.config, job.path)
     assert same.state.name == "done"
 
 
 def test_another_run_in_the_directory_is_refused(tmp_path):
-    job = fakes.tiny_job(tmp_path)
-    fakes.write_run(fakes.tiny_job(tmp_path, **{"planner.horizon": 2}).config, job.path)
+    job = random_job(tmp_path, **{"planner.horizon": 3})
+    write_level(job.path, random_job(tmp_path, **{"planner.horizon": 2}).config)
     assert job.state.name == "failed"
     assert "other settings (planner.horizon: 2 -> 3)" in job.state.note
-    fakes.write_run(job.config, tmp_path / "again")
-    assert Job(job.config, tmp_path / "again").state == State("done", 2)
+    write_level(tmp_path / "again", job.config)
+    assert Job(job.config, tmp_path / "again").state == State("done", 1)
 
 
 def test_settings_of_an_arm_win_over_those_of_the_comparison(tmp_path):
     chosen = {"model.num_heads": 4, "planner.horizon": 7}
-    comparison = Comparison(experiment("fig14"), ("pendulum",), (0,), "smoke", tmp_path, chosen)
-    configs = [job.config for job in comparison.jobs]
+    configs = [job.config for job in comparison(tmp_path, "fig14", **chosen).jobs]
     assert [config.model.num_heads for config in configs] == [1, 2, 3, 5, 8]
     assert {config.planner.horizon for config in configs} == {7}
 
 
 def test_jobs_of_the_first_seed_come_first(tmp_path):
-    comparison = Comparison(experiment("fig13"), ("pendulum", "hopper"), (4, 2), "smoke", tmp_path)
-    assert [job.config.seed for job in comparison.jobs] == [4, 4, 4, 4, 2, 2, 2, 2]
+    jobs = comparison(tmp_path, envs=("pendulum", "hopper"), seeds=(4, 2)).jobs
+    assert [job.config.seed for job in jobs] == [4, 4, 4, 4, 2, 2, 2, 2]
 
 
 def test_two_arms_with_the_same_settings_share_one_job(tmp_path):
     same = sweep_experiment("mine", ["tmcl"], {"fitting.weight_decay": [1, 1.0]})
-    comparison = Comparison(same, ("pendulum",), (0,), "smoke", tmp_path)
-    assert (len(comparison.cells), len(comparison.jobs)) == (2, 1)
+    made = comparison(tmp_path, same)
+    assert (len(made.cells), len(made.jobs)) == (2, 1)
 
 
 @pytest.mark.parametrize(
@@ -88,14 +73,14 @@ def test_two_arms_with_the_same_settings_share_one_job(tmp_path):
 )
 def test_what_is_asked_twice_or_not_at_all_is_refused(envs, seeds, tmp_path):
     with pytest.raises(ConfigError, match="allowed: one or more, each once"):
-        Comparison(experiment("fig13"), envs, seeds, "smoke", tmp_path)
+        comparison(tmp_path, envs=envs, seeds=seeds)
 
 
 def test_missing_runs_are_made_once_and_a_failing_one_stops_no_other(tmp_path, capsys):
     jobs = [random_job(tmp_path, seed) for seed in (2, 0, 1)]
     jobs[1].path.mkdir(parents=True)
     (jobs[1].path / "config.json").mkdir()  # nothing that a check before training can see
-    fakes.write_run(jobs[2].config, jobs[2].path)
+    write_level(jobs[2].path, jobs[2].config)
     damaged = random_job(tmp_path, 3)
     damaged.path.mkdir(parents=True)
     (damaged.path / "config.json").write_text("{")
@@ -135,10 +120,9 @@ def test_an_environment_of_ones_own_is_found_by_the_workers(tmp_path, monkeypatc
     module = "from headway.task import env_spec\n\ncart = env_spec('pendulum')\n"
     (tmp_path / "own_carts.py").write_text(module)
     monkeypatch.syspath_prepend(tmp_path)
-    experiment = sweep_experiment("own", ["random"], {})
-    jobs = Comparison(experiment, ("own_carts:cart",), (0,), "smoke", tmp_path).jobs
-    assert run_jobs(jobs, HERE) == {}
-    assert [job.state.name for job in jobs] == ["done"]
+    (job,) = comparison(tmp_path, sweep_experiment("own", ["random"], {}), ("own_carts:cart",)).jobs
+    assert run_jobs([job], HERE) == {}
+    assert job.state.name == "done"
 
 
 def test_a_run_that_loses_all_its_workers_fails_and_says_so(tmp_path, monkeypatch):

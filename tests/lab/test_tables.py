@@ -1,33 +1,29 @@
 """The table of runs: numbers against hand-made ones, labels, scores, damage."""
 
 import csv
-import io
 import json
 import shutil
 import subprocess
 import sys
 
+import fakes
 import numpy as np
 import pytest
-from rich.console import Console
 
+from headway.cli import Command
 from headway.errors import RunError
 from headway.lab.tables import (
     axis_label,
     by_group,
     by_physics,
     distinct,
-    episode_table,
     evaluation,
-    facts,
     full_label,
     read_runs,
     varying,
 )
 from headway.training.methods import make_config
 from headway.training.run import EpisodeRow
-
-HOSTILE = '<script>alert("1")</script>&amp;$x_{2}$'
 
 
 def mean_of(path, length, iteration=4):
@@ -39,20 +35,20 @@ def mean_of(path, length, iteration=4):
     )
 
 
-def test_numbers_are_those_of_the_files(folder):
-    runs = read_runs([folder])
+def test_numbers_are_those_of_the_files(written):
+    runs = read_runs([written])
     parts = by_physics(runs.final).set_index(["label", "seed", "sim_params"])
     one = parts.loc[("pets", 1, "length=0.5 mass=1")]
-    assert one.return_mean == pytest.approx(mean_of(folder / "pets-1", 0.5))
+    assert one.return_mean == pytest.approx(mean_of(written / "pets-1", 0.5))
     low, high = (
-        np.mean([mean_of(folder / f"{name}-{seed}", 0.5) for seed in range(3)])
+        np.mean([mean_of(written / f"{name}-{seed}", 0.5) for seed in range(3)])
         for name in ("random", "true-dynamics")
     )
     assert one.score == pytest.approx((one.return_mean - low) / (high - low))
     group = by_group(runs.final).set_index(["label", "seed", "group"]).loc[("pets", 1, "low")]
-    means = [mean_of(folder / "pets-1", length) for length in (0.25, 0.375)]
+    means = [mean_of(written / "pets-1", length) for length in (0.25, 0.375)]
     assert group.return_mean == pytest.approx(np.mean(means))
-    assert runs.runs.set_index("run").loc[str(folder / "pets-1"), "collect"] == 5
+    assert runs.runs.set_index("run").loc[str(written / "pets-1"), "collect"] == 5
     assert not runs.notes
 
 
@@ -62,13 +58,12 @@ def test_the_projects_references_serve_where_no_run_is_one(run_dir):
     assert one.score == pytest.approx((one.return_mean + 1501) / (-126 + 1501))
 
 
-def test_references_that_planned_in_several_ways_normalise_nothing(tmp_path, write_run):
+def test_references_that_planned_in_several_ways_normalise_nothing(tmp_path):
     for horizon in (10, 30):
-        planner = {"horizon": horizon}
-        path = tmp_path / f"ceiling-{horizon}"
-        write_run(path, method="true-dynamics", env="own", planner=planner)
-    write_run(tmp_path / "random", method="random", env="own", lift=-900)
-    write_run(tmp_path / "tmcl", env="own")
+        path, planner = tmp_path / f"ceiling-{horizon}", {"planner.horizon": horizon}
+        fakes.write(path, "true-dynamics", env="own", **planner)
+    fakes.write(tmp_path / "random", "random", env="own", lift=-900)
+    fakes.write(tmp_path / "tmcl", env="own")
     runs = read_runs([tmp_path])
     assert runs.episodes.score.isna().all()
     compared = runs.runs[~runs.runs.is_reference]
@@ -77,10 +72,10 @@ def test_references_that_planned_in_several_ways_normalise_nothing(tmp_path, wri
     ]  # fmt: skip
 
 
-def test_variants_are_named_by_what_differs(tmp_path, write_run):
-    write_run(tmp_path / "a", planner={"horizon": 10, "head_selection": "adaptive"})
-    write_run(tmp_path / "b", planner={"horizon": 20, "head_selection": "adaptive"})
-    write_run(tmp_path / "c", method="pets", planner={"horizon": 20})
+def test_variants_are_named_by_what_differs(tmp_path):
+    fakes.write(tmp_path / "a", **{"planner.horizon": 10})
+    fakes.write(tmp_path / "b")
+    fakes.write(tmp_path / "c", "pets")
     runs = read_runs([tmp_path]).runs
     assert set(runs.label) == {"tmcl, horizon 10", "tmcl, horizon 20", "pets"}
 
@@ -148,24 +143,22 @@ def test_a_group_score_counts_each_physics_once():
 
     config = make_config("pendulum")
     rows = [row(0.5, -126.0), row(1.0, -1143.0), row(1.0, -1143.0)]
-    assert [part["episodes"] for part in facts(by_physics(episode_table(rows, config)))] == [1, 2]
-    (group,) = facts(by_group(episode_table(rows, config)))
+    facts, _ = evaluation(rows, config)
+    assert [part["episodes"] for part in facts["physics"]] == [1, 2]
+    (group,) = facts["groups"]
     assert group["score"] == pytest.approx(0.5)
     assert (group["episodes"], group["return_mean"]) == (3, (-126 - 1143) / 2)
     assert group["return_std"] == pytest.approx((1143 - 126) / 2)
-    rows.append(row(9.0, 0.0))
-    assert facts(by_group(episode_table(rows, config)))[0]["score"] is None
+    unknown, _ = evaluation([*rows, row(9.0, 0.0)], config)
+    assert unknown["groups"][0]["score"] is None
 
 
-def test_brackets_in_names_are_no_markup():
-    physics = {"length": 0.5, "mass": 1.0}
-    rows = [EpisodeRow("tmcl", "pendulum", 0, 0, "[/x]", physics, 0, -126.0, 200)]
-    table = evaluation(rows, make_config("pendulum"), "runs/[/x][bold]")
-    console = Console(width=120, file=io.StringIO(), record=True)
-    console.print(table)
-    text = console.export_text()
-    assert "runs/[/x][bold]" in text
-    assert "unseen: [/x]" in text
+def test_brackets_in_names_are_no_markup(capsys):
+    row = EpisodeRow("tmcl", "pendulum", 0, 0, "[/x]", {"length": 0.5, "mass": 1.0}, 0, -126.0, 200)
+    Command().show({}, evaluation([row], make_config("pendulum"), "runs/[/x][bold]")[1])
+    out = capsys.readouterr().out
+    assert "runs/[/x][bold]" in out
+    assert "unseen: [/x]" in out
 
 
 def test_physics_are_written_for_readers():

@@ -75,8 +75,8 @@ def test_a_perfect_head_is_found_and_costs_nothing():
     found = examine(agent.model, episodes, key=jax.random.key(0))
     np.testing.assert_array_equal([e.best for e in found], [[0, 1], [1, 0], [0, 1]])
     summary = summarise(found, window=3)
-    assert summary.wrong == 0
-    assert summary.settling == 1
+    assert summary.wrong_selections == 0
+    assert summary.settling_steps == 1
     assert summary.settled == 1
     assert summary.chosen_error == pytest.approx(0, abs=1e-9)
     assert summary.regret == pytest.approx(0, abs=1e-9)
@@ -93,7 +93,7 @@ def test_regret_and_wrong_selections_by_hand():
     assert summary.chosen_error == (0 + 4 + 1 + 1) / 4
     assert summary.regret == pytest.approx(0.5)
     assert summary.average_error == (0.5 + 2.5 + 2.5 + 2.5) / 4
-    assert summary.wrong == 0.5
+    assert summary.wrong_selections == 0.5
     np.testing.assert_array_equal(summary.head_errors, [[3, 1]])
 
 
@@ -121,9 +121,9 @@ def test_settling(chosen, window, settles):
 def test_what_never_settles_is_counted():
     right, wrong = by_hand([[1, 0]] * 4, [0, 1, 1, 1]), by_hand([[1, 0]] * 4, [0, 1, 0, 1])
     summary = summarise([right, right, wrong], window=2)
-    assert summary.settling == 2
+    assert summary.settling_steps == 2
     assert summary.settled == pytest.approx(2 / 3)
-    assert summarise([wrong], window=2).settling is None
+    assert summarise([wrong], window=2).settling_steps is None
 
 
 @pytest.mark.parametrize("spread", [1.0, 2.0])

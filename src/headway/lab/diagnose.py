@@ -14,17 +14,11 @@ from headway.errors import ConfigError
 from headway.lab.tables import COLLECTED, distinct, full_label, group_label, new_table, varying
 from headway.models.acting import MultiHeadModel
 from headway.task import sim_param_sets
+from headway.training import selection
 from headway.training.evaluate import evaluate, known_groups
 from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
 from headway.training.run import RunDir
-from headway.training.selection import (
-    LEVELS,
-    EpisodeSelection,
-    SelectionSummary,
-    examine,
-    summarise,
-)
 from headway.training.trainers import load_agent
 
 
@@ -36,7 +30,7 @@ class Diagnosis:
     """The run directory."""
     config: Config
     """All settings."""
-    episodes: dict[str, list[EpisodeSelection]]
+    episodes: dict[str, list[selection.EpisodeSelection]]
     """Predictions of all heads, by group and in the order of the episodes."""
 
     @property
@@ -44,16 +38,16 @@ class Diagnosis:
         """Right selections in a row after which selection has settled: as many as it looks at."""
         return self.config.planner.selection_length
 
-    def summary(self, group: str) -> SelectionSummary:
+    def summary(self, group: str) -> selection.SelectionSummary:
         """The averages of a group."""
-        return summarise(self.episodes[group], self.window)
+        return selection.summarise(self.episodes[group], self.window)
 
-    def by_physics(self, group: str) -> list[tuple[dict[str, float], SelectionSummary]]:
+    def by_physics(self, group: str) -> list[tuple[dict[str, float], selection.SelectionSummary]]:
         """The averages of each physics of a group, in ascending order."""
         found = []
         for physics in distinct(episode.sim_params for episode in self.episodes[group]):
             same = [e for e in self.episodes[group] if dict(e.sim_params) == physics]
-            found.append((physics, summarise(same, self.window)))
+            found.append((physics, selection.summarise(same, self.window)))
         return found
 
 
@@ -118,7 +112,7 @@ def diagnose(
     assert isinstance(agent.model, MultiHeadModel)
     key = jax.random.key(config.evaluation.seed)
     episodes = {
-        group: examine(agent.model, found, key=jax.random.fold_in(key, i))
+        group: selection.examine(agent.model, found, key=jax.random.fold_in(key, i))
         for i, (group, found) in enumerate(trajectories.items())
     }
     return Diagnosis(run.path, config, {group: found for group, found in episodes.items() if found})
@@ -127,81 +121,62 @@ def diagnose(
 def facts(diagnosis: Diagnosis) -> dict[str, Any]:
     """The diagnosis as plain values, for JSON."""
 
-    def plain(summary: SelectionSummary) -> dict[str, Any]:
-        names = ("episodes", "chosen_error", "best_error", "average_error", "regret", "settled")
-        calibration = summary.calibration
-        return {
-            **{name: getattr(summary, name) for name in names},
-            "wrong_selections": summary.wrong,
-            "settling_steps": summary.settling,
-            "head_errors": summary.head_errors.tolist(),
-            "calibration": calibration
-            and {
-                "mean_square": calibration.mean_square,
-                "inside": {f"{level:g}": share for level, share in calibration.inside.items()},
-            },
-        }
+    def plain(summary: selection.SelectionSummary) -> dict[str, Any]:
+        errors = {"head_errors": summary.head_errors.tolist(), "regret": summary.regret}
+        return dataclasses.asdict(summary) | errors
 
     groups = []
     for group in diagnosis.episodes:
         physics = [{"sim_params": p, **plain(found)} for p, found in diagnosis.by_physics(group)]
         groups.append({"group": group, **plain(diagnosis.summary(group)), "physics": physics})
-    return {
-        "run_dir": str(diagnosis.path), "settled_after": diagnosis.window, "groups": groups
-    }  # fmt: skip
+    settled_after = {"settled_after": diagnosis.window}
+    return {"run_dir": str(diagnosis.path), **settled_after, "groups": groups}
 
 
 def tables(diagnosis: Diagnosis) -> list[Table]:
     """Lay a diagnosis out: selection, errors of each head, calibration."""
-    everything = [e.sim_params for episodes in diagnosis.episodes.values() for e in episodes]
-    names = varying(everything)
+    names = varying([e.sim_params for episodes in diagnosis.episodes.values() for e in episodes])
     groups = {group: diagnosis.summary(group) for group in diagnosis.episodes}
-    lines = []
-    for group, summary in groups.items():
-        lines.append((_name(group), summary, "bold"))
-        for physics, found in diagnosis.by_physics(group):
-            lines.append((f"  {full_label(physics, names)}", found, ""))
     numbers = ["episodes", "chosen", "best", "average", "regret", "wrong", "settles", "settled"]
-    selection = new_table(f"Head selection: {diagnosis.path}", "physics", numbers=numbers)
-    for name, summary, style in lines:
-        errors = (summary.chosen_error, summary.best_error, summary.average_error)
-        relative = summary.best_error and f"{summary.regret / summary.best_error:+.1%}"
-        settles = "never" if summary.settling is None else f"{summary.settling:g}"
-        cells = [f"{error:.3g}" for error in errors]
-        cells += [relative or "–", f"{summary.wrong:.0%}", settles, f"{summary.settled:.0%}"]
-        selection.add_row(name, str(summary.episodes), *cells, style=style)
-    selection.caption = (
+    chosen = new_table(f"Head selection: {diagnosis.path}", "physics", numbers=numbers)
+    count = max((summary.head_errors.shape[1] for summary in groups.values()), default=0)
+    numbers = [*(f"head {head}" for head in range(count)), "best head"]
+    heads = new_table("Error of each head", "physics", "member", numbers=numbers)
+    numbers = ["mean square", *(f"inside {level:.0%}" for level in selection.LEVELS)]
+    title = "Calibration of the predicted variance, chosen heads"
+    calibration = new_table(title, "physics", numbers=numbers)
+    for group, summary in groups.items():
+        lines = [(group_label(group), summary)]
+        for physics, found in diagnosis.by_physics(group):
+            lines.append((f"  {full_label(physics, names)}", found))
+        for name, found in lines:
+            style = "bold" if found is summary else None
+            errors = (found.chosen_error, found.best_error, found.average_error)
+            relative = found.best_error and f"{found.regret / found.best_error:+.1%}"
+            settles = "never" if found.settling_steps is None else f"{found.settling_steps:g}"
+            cells = [str(found.episodes), *(f"{error:.3g}" for error in errors), relative or "–"]
+            cells += [f"{found.wrong_selections:.0%}", settles, f"{found.settled:.0%}"]
+            chosen.add_row(name, *cells, style=style)
+            if found.calibration is not None:
+                shares = [f"{found.calibration.inside[level]:.1%}" for level in selection.LEVELS]
+                mean_square = f"{found.calibration.mean_square:.3g}"
+                calibration.add_row(name, mean_square, *shares, style=style)
+        for member, errors in enumerate(summary.head_errors):
+            name = "" if member else group_label(group)
+            cells = [f"{error:.3g}" for error in errors]
+            heads.add_row(name, str(member), *cells, str(errors.argmin()))
+        heads.add_section()
+    chosen.caption = (
         "errors: mean squares in normalised units, of the chosen head, the best one of each episode"
         " in hindsight, and all heads; regret: chosen above best; wrong: chosen is not the best;"
         f" settles: transitions seen before the best is chosen {diagnosis.window} times in a row"
         " (median); settled: share of episodes and members where that happens"
     )
     if diagnosis.config.planner.head_selection == "average":
-        selection.caption += ". This run plans with the average; chosen is what it would select."
-    count = max((summary.head_errors.shape[1] for summary in groups.values()), default=0)
-    numbers = [*(f"head {head}" for head in range(count)), "best head"]
-    heads = new_table("Error of each head", "physics", "member", numbers=numbers)
-    for group, summary in groups.items():
-        for member, errors in enumerate(summary.head_errors):
-            cells = [f"{error:.3g}" for error in errors]
-            name = "" if member else _name(group)
-            heads.add_row(name, str(member), *cells, str(errors.argmin()))
-        heads.add_section()
+        chosen.caption += ". This run plans with the average; chosen is what it would select."
     heads.caption = "mean squares in normalised units; head numbers of members are unrelated"
-    numbers = ["mean square", *(f"inside {level:.0%}" for level in LEVELS)]
-    title = "Calibration of the predicted variance, chosen heads"
-    calibration = new_table(title, "physics", numbers=numbers)
-    for name, summary, style in lines:
-        if summary.calibration is not None:
-            shares = [f"{summary.calibration.inside[level]:.1%}" for level in LEVELS]
-            mean_square = f"{summary.calibration.mean_square:.3g}"
-            calibration.add_row(name, mean_square, *shares, style=style)
     calibration.caption = (
         "mean square: of the error in predicted standard deviations; 1 is right, more is too sure."
         " inside: share of the truth within the central interval of that level"
     )
-    return [selection, heads, *[calibration] * bool(calibration.row_count)]
-
-
-def _name(group: str) -> str:
-    return "training, collected" if group == COLLECTED else group_label(group)
+    return [chosen, heads, *[calibration] * bool(calibration.row_count)]

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from headway import envs
 from headway.errors import BadEnvironmentError, ConfigError
-from headway.lab.figures import INK, figure, legend, numbers
+from headway.lab.figures import INK, figure, numbers
 from headway.lab.tables import Physics, full_label, varying
 from headway.task import EnvSpec, env_spec
 
@@ -59,7 +59,7 @@ def plot_dynamics(env: str, out: str | Path, *, num_states: int = 100, seed: int
         for sim_params, color in zip(physics[1:], colors, strict=True)
     }
     looks["default physics"] = {"color": INK, "linestyle": "", "marker": "."}
-    with figure(Path(out), title=title, caption=caption, size=(9.4, 3.6)) as drawing:
+    with figure(Path(out), title=title, caption=caption, size=(9.4, 3.6), looks=looks) as drawing:
         plane, against = drawing.subplots(1, 2)
         plane.plot(varied[..., first], varied[..., second], color="#cccccc", linewidth=0.7)
         for change, style in zip([*varied, default], looks.values(), strict=True):
@@ -70,7 +70,6 @@ def plot_dynamics(env: str, out: str | Path, *, num_states: int = 100, seed: int
         numbers(against, x=f"{names[first]}, default physics", y=names[first])
         for axes in (plane, against):
             axes.grid(visible=True, axis="both")
-        legend(drawing, looks)
     return Path(out)
 
 

@@ -18,101 +18,44 @@ import numpy as np
 import pandas as pd
 from markupsafe import escape
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from headway.lab import statistics, tables
-from headway.lab.tables import (
-    COLLECTED,
-    TRAIN,
-    axis_label,
-    distinct,
-    group_label,
-    value_label,
-    varying,
-)
+from headway.lab.tables import COLLECTED, TRAIN, group_label
 from headway.training.files import write_bytes
 from headway.training.methods import METHODS
 from headway.training.run import parse_sim_params
 
-INK, FAINT, RULE, GROUND = "#222222", "#7a7a7a", "#e4e4e4", "#f4f4f4"
-_LABELS = {
-    "#0072b2": "#5aaee8",
-    "#d55e00": "#f28a45",
-    "#009e73": "#35c79a",
-    "#b0578d": "#e39cc6",
-    "#c98a00": "#f0b93a",
-    "#3f3f46": "#d4d4d8",
-    "#4aa3d6": "#a5d8f6",
-    "#8a7a00": "#ded35c",
-}
-_HEADS = {
-    "#0173b3": "#3d9be0",
-    "#e69f00": "#e6a817",
-    "#019f74": "#2bb68a",
-    "#cc79a7": "#d893b8",
-    "#56b4e9": "#7cc7f2",
-    "#d65f01": "#e8792e",
-    "#f0e442": "#efe35a",
-    "#999999": "#a3a3a3",
-}
-LABELS, HEADS = tuple(_LABELS), tuple(_HEADS)
+STYLE = matplotlib.rc_params_from_file(
+    Path(__file__).with_name("headway.mplstyle"), use_default_template=False
+)
+INK, FAINT, RULE = STYLE["text.color"], STYLE["xtick.color"], STYLE["grid.color"]
+GROUND = "#f4f4f4"
+LABELS = ("#0072b2", "#d55e00", "#009e73", "#b0578d", "#c98a00", "#3f3f46", "#4aa3d6", "#8a7a00")
+HEADS = ("#0173b3", "#e69f00", "#019f74", "#cc79a7", "#56b4e9", "#d65f01", "#f0e442", "#999999")
 MARKERS, DASHES = "osD^vPX*", ("-", "--", ":")
 THEME = {
-    **{"ink": (INK, "#e7e7ea"), "faint": (FAINT, "#9c9ca6"), "rule": (RULE, "#33343b")},
-    **{"axis": ("#9a9a9a", "#60616b"), "paper": ("#ffffff", "#17181c")},
-    "ground": (GROUND, "#26272e"),
-    **{f"s{i}": pair for i, pair in enumerate(_LABELS.items())},
-    **{f"h{i}": pair for i, pair in enumerate(_HEADS.items())},
+    **{"ink": INK, "faint": FAINT, "rule": RULE, "axis": STYLE["axes.edgecolor"]},
+    **{"ground": GROUND, "paper": "#ffffff"},
+    **{f"s{i}": color for i, color in enumerate(LABELS)},
+    **{f"h{i}": color for i, color in enumerate(HEADS)},
 }
-"""Variables of the page's style sheet: a colour in light and in dark."""
-
-_STYLE: dict[Any, Any] = {
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],
-    "font.size": 9.0,
-    "text.color": INK,
-    "text.usetex": False,
-    "text.parse_math": False,  # a dollar is a dollar
-    "axes.facecolor": "none",
-    "axes.edgecolor": "#9a9a9a",
-    "axes.labelcolor": INK,
-    "axes.labelsize": 9.0,
-    "axes.linewidth": 0.8,
-    "axes.titlesize": 9.5,
-    "axes.titlelocation": "left",
-    "axes.titlepad": 8.0,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.grid.axis": "y",
-    "axes.axisbelow": True,
-    "axes.unicode_minus": True,
-    "grid.color": RULE,
-    "grid.linewidth": 0.8,
-    "xtick.color": FAINT,
-    "ytick.color": FAINT,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "xtick.labelsize": 8.5,
-    "ytick.labelsize": 8.5,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "lines.linewidth": 1.7,
-    "lines.solid_capstyle": "round",
-    "figure.facecolor": "white",
-    "svg.hashsalt": "headway",
-}
+"""Variables of the page's style sheet, which gives them other colours in the dark."""
 
 Looks = Mapping[str, Mapping[str, Any]]
 
 
 @contextlib.contextmanager
 def figure(
-    path: Path, *, title: str, caption: str, size: tuple[float, float], svg: bool = False
+    path: Path,
+    *,
+    title: str,
+    caption: str,
+    size: tuple[float, float],
+    looks: Looks | None = None,
+    svg: bool = False,
 ) -> Iterator[Figure]:
     """Make a figure, hand it out to be drawn on, and write it.
 
@@ -121,15 +64,25 @@ def figure(
         title: One line that says what is seen.
         caption: What the marks are and where the numbers come from; wrapped to the width.
         size: Width and height of what is drawn in inches; title, legend and caption come on top.
+        looks: Explained above the axes, in as many columns as the width has room for.
         svg: Whether to write an SVG file beside the PNG as well.
     """
-    with matplotlib.rc_context(_STYLE):
+    with matplotlib.rc_context(STYLE):
         drawing = Figure(figsize=size, layout="constrained")
-        canvas = FigureCanvasAgg(drawing)
         yield drawing
         # Around the axes, in inches from the figure's box: the file is cut to what it holds.
-        canvas.draw()
-        above = 0.14 + sum(box.get_window_extent().height / drawing.dpi for box in drawing.legends)
+        above = 0.14
+        if looks:
+            keys = [
+                Line2D([], [], label=label, **{"markersize": 4, **look})
+                for label, look in looks.items()
+            ]
+            columns = int(size[0] / (0.62 + 0.068 * max(map(len, looks))))
+            place = {"loc": "lower left", "bbox_to_anchor": (0.005, 1.0)}
+            legend = drawing.legend(handles=keys, ncols=min(max(columns, 1), len(keys)), **place)
+            legend.set_in_layout(False)
+            drawing.draw_without_rendering()
+            above += legend.get_window_extent().height / drawing.dpi
         heading = {"va": "bottom", "fontsize": 11, "fontweight": "bold"}
         drawing.text(0.01, 1 + above / size[1], title, **heading)
         lines = textwrap.fill(caption, int(size[0] / 0.058))
@@ -137,28 +90,9 @@ def figure(
         drawing.text(0.01, -0.1 / size[1], lines, **small)
         for kind in ("png", *["svg"] * svg):
             image = io.BytesIO()
-            look: dict[str, Any] = {"dpi": 160} if kind == "png" else {"metadata": {"Date": None}}
-            drawing.savefig(image, format=kind, bbox_inches="tight", pad_inches=0.16, **look)
+            cut: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.16}
+            drawing.savefig(image, format=kind, metadata=dict.fromkeys(["Date"]), **cut)
             write_bytes(path.with_suffix(f".{kind}"), image.getvalue())
-
-
-def legend(drawing: Figure, looks: Looks) -> None:
-    """Explain looks above the axes, in as many columns as the width has room for."""
-    handles = [
-        Patch(color=look["color"], label=label)
-        if look.get("marker") == "patch"
-        else Line2D([], [], label=label, **{"markersize": 4, **look})
-        for label, look in looks.items()
-    ]
-    needed = 0.62 + 0.068 * max(map(len, looks))
-    drawing.legend(
-        handles=handles,
-        loc="lower left",
-        bbox_to_anchor=(0.005, 1.0),
-        borderaxespad=0.3,
-        borderpad=0,
-        ncols=min(max(int(drawing.get_figwidth() / needed), 1), len(handles)),
-    ).set_in_layout(False)
 
 
 def panel(
@@ -166,7 +100,7 @@ def panel(
     *,
     name: str,
     label: str,
-    size: tuple[float, float] = (3.5, 2.5),
+    size: tuple[float, float] = (3.7, 2.65),
 ) -> str:
     """Draw a figure of one axes as an SVG element in the colours of the page's theme.
 
@@ -174,46 +108,28 @@ def panel(
 
     Args:
         draw: Draws on the axes it is given.
-        name: Unique on the page; every identifier inside begins with it.
+        name: Unique on the page, so that identifiers inside are too.
         label: What is seen, for those who cannot see it.
         size: Width and height in inches: small enough to be read on a phone.
     """
-    small: dict[Any, Any] = {
-        "font.size": 8.5,
-        "axes.labelsize": 8.5,
-        "xtick.labelsize": 8,
-        "ytick.labelsize": 8,
-    }
     inline: dict[Any, Any] = {
         "svg.fonttype": "none",
         "savefig.facecolor": "none",
         "svg.hashsalt": name,
     }
-    with matplotlib.rc_context({**_STYLE, **small, **inline}):
+    with matplotlib.rc_context({**STYLE, **inline}):
         drawing = Figure(figsize=size, layout="constrained")
         draw(drawing.subplots())
         written = io.StringIO()
-        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        drawing.savefig(written, format="svg", metadata=nothing)
+        drawing.savefig(written, format="svg")
     svg = re.sub(r"<(metadata|style).*?</\1>", "", written.getvalue(), flags=re.DOTALL)
-    svg = svg[svg.index("<svg") :]
-    box = re.search(r'viewBox="([-\d. ]+)"', svg)
-    svg = svg[svg.index(">") + 1 :]
-    variables = {light: f"var(--{variable})" for variable, (light, _) in THEME.items()}
-    svg = re.sub(
-        r"(fill|stroke): (#[0-9a-f]{6})\b",
-        lambda found: f"{found[1]}: {variables.get(found[2], found[2])}",
-        svg,
-    )
+    variables = {color: f"var(--{variable})" for variable, color in THEME.items()}
+    svg = re.sub(r"(?<=: )#[0-9a-f]{6}\b", lambda hit: variables.get(hit[0], hit[0]), svg)
     svg = re.sub(r'<g id="series-(\d+)(?:-\d+)?">', r'<g class="series-\1">', svg)
-    svg = re.sub(r'(<\w+) id="', rf'\1 id="{name}-', svg)
-    svg = re.sub(r' xlink:href="#', f' href="#{name}-', svg).replace("url(#", f"url(#{name}-")
-    svg = re.sub(r" font-family: [^;\"]*;", "", svg)
+    svg = re.sub(r'<g id="[^"]*">', "<g>", svg)
     svg = re.sub(r'(?<= d=")[^"]*', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), svg)
-    return (
-        f'<svg viewBox="{box[1] if box else ""}" role="img" aria-label="{escape(label)}">'
-        + re.sub(r"\s*\n\s*", "\n", svg).strip()
-    )
+    svg = svg[svg.index("<svg") + 4 :]
+    return f'<svg role="img" aria-label="{escape(label)}"' + re.sub(r"\s*\n\s*", "\n", svg)
 
 
 def look(index: int) -> dict[str, Any]:
@@ -233,7 +149,7 @@ def are_methods(arms: Sequence[Any]) -> bool:
 def arm_looks(arms: Sequence[Any]) -> dict[str, dict[str, Any]]:
     """Looks of an experiment's arms; where arms are methods, a method has one look everywhere."""
     main = ("tmcl", "mcl", "pets", "mh-pets", "pets-cadm", "grbal", "rebal", "ria")
-    order = [*main, *(name for name in METHODS if name not in main)]
+    order = list(dict.fromkeys((*main, *METHODS)))
     methods = are_methods(arms)
     return {
         arm.label: look(order.index(arm.method) if methods else i) for i, arm in enumerate(arms)
@@ -256,6 +172,11 @@ def numbers(axes: Axes, *, x: str = "", y: str = "") -> None:
             axis.set_major_locator(MaxNLocator(5))
             axis.set_major_formatter(lambda value, _: f"{value:,.10g}".replace("-", "−"))
             axis.set_label_text(name)
+
+
+def _band(axes: Axes, x: Any, low: Any, high: Any, style: Mapping[str, Any]) -> None:
+    shared = {"color": style["color"], "gid": style.get("gid")}
+    axes.fill_between(x, low, high, alpha=0.14, linewidth=0, **shared)
 
 
 def curves(axes: Axes, table: pd.DataFrame, looks: Looks) -> None:
@@ -286,8 +207,8 @@ def curves(axes: Axes, table: pd.DataFrame, looks: Looks) -> None:
         columns = returns.to_numpy().T[:, :, None]
         if len(returns) >= statistics.MIN_RUNS:
             ends = [statistics.estimate([c], statistics.mean).interval for c in columns]
-            band = axes.fill_between(steps, *np.array(ends).T, color=style["color"], alpha=0.14)
-            band.set(linewidth=0, gid=style.get("gid"))
+            low, high = np.array(ends).T
+            _band(axes, steps, low, high, style)
         elif len(returns) > 1:
             axes.plot(steps, columns[:, :, 0], **thin)
         if own.finished.any():
@@ -347,7 +268,7 @@ def by_physics(
         joined: Draw a line through the means of each label instead of every value.
     """
     by_text = {text: parse_sim_params(text) for text in table.sim_params.unique()}
-    physics = distinct(by_text.values())
+    physics = tables.distinct(by_text.values())
     places = table.sim_params.map({text: physics.index(p) for text, p in by_text.items()})
     for place in places[table.group != TRAIN].unique():
         axes.axvspan(place - 0.5, place + 0.5, color=GROUND, zorder=0, linewidth=0)
@@ -363,12 +284,12 @@ def by_physics(
                      alpha=0.55, linewidths=0)  # fmt: skip
         for place, mean in zip(means.index.to_numpy(float), means, strict=True):
             axes.plot([place - 0.3, place + 0.3], [mean] * 2, color=style["color"], linewidth=2.6)
-    names = varying(physics)
+    names = tables.varying(physics)
     axes.set_xlim(-0.5, len(physics) - 0.5)
     numbers(axes, y=name)
-    axes.set_xticks(range(len(physics)), [value_label(p, names) for p in physics])
+    axes.set_xticks(range(len(physics)), [tables.value_label(p, names) for p in physics])
     axes.tick_params(axis="x", length=0)
-    axes.set_xlabel(axis_label(names))
+    axes.set_xlabel(tables.axis_label(names))
 
 
 def error_lines(axes: Axes, table: pd.DataFrame, looks: Looks) -> None:
@@ -385,10 +306,7 @@ def error_lines(axes: Axes, table: pd.DataFrame, looks: Looks) -> None:
     for label, own in table.groupby("label", sort=False):
         style, errors = looks[str(label)], own.groupby("step").error
         if own["run"].nunique() > 1:
-            band = axes.fill_between(
-                errors.mean().index, errors.min(), errors.max(), color=style["color"], alpha=0.14
-            )
-            band.set(linewidth=0, gid=style.get("gid"))
+            _band(axes, errors.mean().index, errors.min(), errors.max(), style)
         axes.plot(errors.mean(), **{"markersize": 3, "markevery": 2, **style})
     axes.axhline(1.0, color=FAINT, linewidth=1, linestyle=":", zorder=1)
     highest = table.error.max()
@@ -407,20 +325,15 @@ def head_shares(axes: Axes, table: pd.DataFrame) -> None:
         axes: Where to draw; wide enough for all members side by side.
         table: member, head, sim_params, share.
     """
-    physics = distinct(map(parse_sim_params, table.sim_params.unique()))
-    shares = table.assign(share=table.share.fillna(0.0).clip(0, 1)).pivot_table(
-        index=["member", "sim_params"], columns="head", values="share", aggfunc="sum"
-    )
-    members = shares.index.get_level_values("member").unique()
-    for (member, text), heads in shares.iterrows():  # type: ignore[misc]
-        left = 1.12 * list(members).index(member)
-        row = physics.index(parse_sim_params(text))
-        for head, share in heads.fillna(0.0).items():
-            color = HEADS[int(str(head)) % len(HEADS)]
-            axes.barh(row, share, 0.82, left, color=color, linewidth=0)
+    physics = tables.distinct(map(parse_sim_params, table.sim_params.unique()))
+    members = sorted(table.member.unique())
+    for (member, text), heads in table.sort_values("head").groupby(["member", "sim_params"]):
+        left, row = 1.12 * members.index(member), physics.index(parse_sim_params(str(text)))
+        for head, share in zip(heads["head"], heads.share.fillna(0.0).clip(0, 1), strict=True):
+            axes.barh(row, share, 0.82, left, color=HEADS[head % len(HEADS)], linewidth=0)
             left += share
-    names = varying(physics)
-    axes.set_yticks(range(len(physics)), [value_label(p, names) for p in physics])
+    names = tables.varying(physics)
+    axes.set_yticks(range(len(physics)), [tables.value_label(p, names) for p in physics])
     axes.set_ylim(len(physics) - 0.5, -0.5)
     axes.set_xticks([1.12 * i + 0.5 for i in range(len(members))], list(map(str, members)))
     axes.set_xlim(0, 1.12 * len(members) - 0.12)
@@ -428,19 +341,18 @@ def head_shares(axes: Axes, table: pd.DataFrame) -> None:
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
     axes.set_xlabel("member")
-    axes.set_ylabel(axis_label(names))
+    axes.set_ylabel(tables.axis_label(names))
 
 
 def _learning_curve(axes: Axes, table: pd.DataFrame, looks: Looks) -> None:
     """Draw one run's mean return by group, with one standard deviation over episodes."""
     for group, own in table.groupby("group", sort=False):
-        style = {"markersize": 4, **looks[str(group)]}
+        style = {"markersize": 4, "elinewidth": 1, **looks[str(group)]}
         middle, spread = own["return"], own["std"]
         if group == COLLECTED:
-            ends = (middle - spread, middle + spread)
-            axes.fill_between(own.timesteps, *ends, color=style["color"], alpha=0.14, linewidth=0)
+            _band(axes, own.timesteps, middle - spread, middle + spread, style)
             spread = None
-        axes.errorbar(own.timesteps, middle, yerr=spread, elinewidth=1, **style)
+        axes.errorbar(own.timesteps, middle, yerr=spread, **style)
     axes.set_xlim(left=0)
     numbers(axes, x="environment steps collected", y="return per episode (sum of rewards)")
 
@@ -459,31 +371,28 @@ def save_run_figures(run_dir: str | Path) -> list[Path]:
     """
     found = tables.read_runs([run_dir])
     (run,) = found.runs.itertuples()
-    folder, made = Path(run_dir) / "figures", []
-    source = f"{run.env}, {run.method}, preset {run.preset}, seed {run.seed}"
+    made: list[Path] = []
 
-    @contextlib.contextmanager
-    def drawn(name: str, title: str, caption: str, size: tuple[float, float]) -> Iterator[Figure]:
-        made.append(folder / f"{name}.png")
-        text = f"{source}{caption}"
-        with figure(made[-1], title=title, caption=text, size=size) as drawing:
-            yield drawing
+    def frame(name: str, title: str, caption: str, size: tuple[float, float], looks: Looks) -> Any:
+        made.append(Path(run_dir) / "figures" / f"{name}.png")
+        text = f"{run.env}, {run.method}, preset {run.preset}, seed {run.seed}{caption}"
+        return figure(made[-1], title=title, caption=text, size=size, looks=looks)
+
+    def named(looks: Looks, **more: Any) -> Looks:
+        return {group_label(group): {**style, **more} for group, style in looks.items()}
 
     last = found.episodes[found.episodes.iteration == found.episodes.iteration.max()]
-    counts = last.groupby("group", sort=False).size()
-    tested = "; ".join(f"{count} test episodes of {group}" for group, count in counts.items())
-    if counts.nunique() == 1:
-        tested = f"{counts.iloc[0]} test episodes per group"
+    groups = last.group.unique()
+    tested = f"{len(last)} test episodes"
     learned = found.curves[found.curves.timesteps > 0]
     if len(learned):
         caption = (
             f". Mean over episodes, band and bars ± 1 standard deviation over episodes; {tested}."
             " The first iteration acts at random; tests follow the fit."
         )
-        with drawn("learning_curve", "Return while learning", caption, (6.6, 3.3)) as drawing:
-            looks = group_looks(list(learned.group.unique()))
+        title, looks = "Return while learning", group_looks(learned.group.unique())
+        with frame("learning_curve", title, caption, (6.6, 3.3), named(looks)) as drawing:
             _learning_curve(drawing.subplots(), learned, looks)
-            legend(drawing, {group_label(group): style for group, style in looks.items()})
     if len(last):
         panels = {"return per episode": last["return"]}
         if last.score.notna().any():
@@ -491,43 +400,39 @@ def save_run_figures(run_dir: str | Path) -> list[Path]:
         caption = (
             f", iteration {last.iteration.max() + 1}. Dots are episodes, bars means; {tested}."
         )
-        size = (6.6 if len(panels) == 1 else 9.2, 3.1)
-        with drawn("evaluation", "Return on training and unseen physics", caption, size) as drawing:
-            looks = group_looks(list(counts.index))
+        title, size = "Return on training and unseen physics", (4.0 + 2.6 * len(panels), 3.1)
+        looks = group_looks(groups)
+        key = named(looks, linestyle="", marker="o")
+        with frame("evaluation", title, caption, size, key) as drawing:
             for i, (name, values) in enumerate(panels.items()):
                 axes = drawing.add_subplot(1, len(panels), i + 1)
                 shown = last.assign(label=last.group, value=values).dropna(subset="value")
                 by_physics(axes, shown, looks, name)
                 for level in (0.0, 1.0) if i else ():
                     axes.axhline(level, color=FAINT, linewidth=1, linestyle=":")
-            marks = {"linestyle": "", "marker": "o"}
-            legend(drawing, {group_label(g): {**style, **marks} for g, style in looks.items()})
-    if found.assignments["head"].nunique() > 1:
+    shares = found.assignments
+    if shares["head"].nunique() > 1:
         caption = (
-            f", iteration {found.assignments.iteration.max() + 1}. Share of the collected segments"
+            f", iteration {shares.iteration.max() + 1}. Share of the collected segments"
             " of each physics whose oracle loss is lowest under each head. Head numbers are"
             " arbitrary: head 0 of one member has nothing to do with head 0 of another."
         )
-        rows = found.assignments.sim_params.nunique()
-        size = (max(1.3 * found.assignments.member.nunique() + 0.6, 5.6), 0.9 + 0.3 * rows)
-        with drawn("head_shares", "Best head of each physics", caption, size) as drawing:
-            head_shares(drawing.subplots(), found.assignments)
-            legend(
-                drawing,
-                {
-                    f"head {head}": {"color": HEADS[head % len(HEADS)], "marker": "patch"}
-                    for head in sorted(found.assignments["head"].unique())
-                },
-            )
+        width = max(1.3 * shares.member.nunique() + 0.6, 5.6)
+        size = (width, 0.9 + 0.3 * shares.sim_params.nunique())
+        square = {"marker": "s", "markersize": 8, "linestyle": ""}
+        looks = {
+            f"head {head}": {"color": HEADS[head % len(HEADS)], **square}
+            for head in sorted(shares["head"].unique())
+        }
+        with frame("head_shares", "Best head of each physics", caption, size, looks) as drawing:
+            head_shares(drawing.subplots(), shares)
     if len(found.errors):
         caption = (
             f", iteration {found.errors.iteration.max() + 1}. Root mean squared error of imagined"
             " observations over moments of test episodes, members and dimensions, in units of each"
             " dimension's standard deviation. At 1, predicting the mean would do as well."
         )
-        title = "Prediction error by imagined step"
-        with drawn("prediction_error", title, caption, (6.6, 3.1)) as drawing:
-            looks = group_looks(list(found.errors.group.unique()))
+        title, looks = "Prediction error by imagined step", group_looks(found.errors.group.unique())
+        with frame("prediction_error", title, caption, (6.6, 3.1), named(looks)) as drawing:
             error_lines(drawing.subplots(), found.errors.assign(label=found.errors.group), looks)
-            legend(drawing, {group_label(group): style for group, style in looks.items()})
     return made

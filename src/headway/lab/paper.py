@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from headway.errors import ConfigError, UnknownNameError, shown, unknown_name
-from headway.training.methods import METHODS
+from headway.training.methods import METHODS, NO_CONTEXT
 
 Settings = Mapping[str, Any]
 Measure = Literal["unseen", "collected"]
@@ -75,10 +75,9 @@ _LABELS = {  # a method that is not named here stands under its own name
 
 
 _METHODS = tuple(Arm(_LABELS.get(name, name), name) for name in METHODS)
-
-
-def _selection(head_selection: str, label: str = "") -> Arm:
-    return Arm(label or head_selection, settings={"planner.head_selection": head_selection})
+_AVERAGE = {"planner.head_selection": "average"}
+# The preset `released-code` would skip the only transition.
+_ONLY_NEWEST = {"planner.selection_length": 1, "planner.selection_skips_newest": False}
 
 
 def _values(letter: str, setting: str, *values: int) -> tuple[Arm, ...]:
@@ -97,15 +96,12 @@ _EXPERIMENTS = (
     Experiment(
         "fig11",
         "adaptive and non-adaptive planning",
-        (_selection("adaptive"), _selection("average", "non-adaptive (average)")),
+        (Arm("adaptive"), Arm("non-adaptive (average)", settings=_AVERAGE)),
     ),
     Experiment(
         "fig12",
         "with and without context learning",
-        (
-            Arm("with context"),
-            Arm("without context", settings={"model.context_size": 0, "model.backward_net": False}),
-        ),
+        (Arm("with context"), Arm("without context", settings=NO_CONTEXT)),
     ),
     Experiment("fig13", "MCL and T-MCL", (Arm("MCL", "mcl"), Arm("T-MCL")), "T-MCL"),
     Experiment(
@@ -125,11 +121,7 @@ _EXPERIMENTS = (
         "fig16",
         "past transitions N that select a head",
         (
-            # The preset `released-code` would skip the only transition.
-            Arm(
-                "N = 1",
-                settings={"planner.selection_length": 1, "planner.selection_skips_newest": False},
-            ),
+            Arm("N = 1", settings=_ONLY_NEWEST),
             *_values("N", "planner.selection_length", 5, 10, 20, 50),
         ),
         "N = 10",
@@ -140,7 +132,13 @@ _EXPERIMENTS = (
         (Arm("three heads"), Arm("one head", settings={"model.num_heads": 1})),
     ),
     Experiment(
-        "selection", "which head plans", tuple(map(_selection, ("adaptive", "average", "random")))
+        "selection",
+        "which head plans",
+        (
+            Arm("adaptive"),
+            Arm("average", settings=_AVERAGE),
+            Arm("random", settings={"planner.head_selection": "random"}),
+        ),
     ),
     Experiment(
         "oracle",

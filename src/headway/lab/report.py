@@ -8,7 +8,8 @@ import base64
 import dataclasses
 import itertools
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,57 +24,34 @@ from headway.errors import ConfigError
 from headway.lab import figures, statistics, tables
 from headway.lab.tables import COLLECTED, PHASES, TRAIN, group_label
 from headway.training.files import write_bytes
-from headway.training.methods import METHODS
 
 RAW_COLUMNS = [
     "env", "label", "seed", "group", "sim_params", "episodes", "return_mean", "return_std",
     "score", "run",
 ]  # fmt: skip
 
-Cell = dict[str, Any]
 Block = dict[str, Any]
+Cell = str | tuple[str, ...]  # a text, and smaller ones below it
 
 
-@dataclasses.dataclass(frozen=True)
 class Page:
-    """Contents of all chapters."""
+    """Contents of all chapters. References are compared only where there are no other runs."""
 
-    found: tables.Runs
-    looks: dict[str, dict[str, Any]]
-    """Looks of the compared labels, in the order of the legend."""
-    parts: pd.DataFrame
-    """Final results by physics of the compared runs; `value` is the score where it is known for a
-    whole environment, else the return."""
-    scored: list[str]
-    """Environments whose scores are known."""
-    counter: Iterator[int] = dataclasses.field(default_factory=itertools.count)
-
-    @classmethod
-    def of(cls, found: tables.Runs) -> "Page":
-        """Choose what is compared: all runs but references, or these if there are no others."""
-        compared = found.runs[~found.runs.is_reference]
-        order = compared.method.map({name: i for i, name in enumerate(METHODS)})
-        by_method = compared.assign(order=order.fillna(len(METHODS)))
-        labels = by_method.sort_values(["order", "method"], kind="stable").label.unique()
-        looks = {
+    def __init__(self, found: tables.Runs):
+        self.found = found
+        self.runs = found.runs[~found.runs.is_reference]
+        self.envs = sorted(self.runs.env.unique())
+        labels = self.runs.sort_values(["order", "method"], kind="stable").label.unique()
+        self.looks = {
             str(label): {**figures.look(i), "gid": f"series-{i}"} for i, label in enumerate(labels)
         }
-        final = found.final
-        parts = tables.by_physics(final[final["run"].isin(compared["run"])])
-        known = parts.groupby("env").score.agg(lambda scores: scores.notna().all())
-        scored = [str(env) for env in known[known].index]
-        parts["value"] = parts.score.where(parts.env.isin(scored), parts.return_mean)
-        return cls(found, looks, parts, scored)
-
-    @property
-    def compared(self) -> pd.DataFrame:
-        """The compared runs."""
-        return self.found.runs[~self.found.runs.is_reference]
-
-    @property
-    def envs(self) -> list[str]:
-        """Environments of the compared runs."""
-        return sorted(self.compared.env.unique())
+        self.parts = tables.by_physics(found.final[found.final["run"].isin(self.runs["run"])])
+        known = self.parts.groupby("env").score.agg(lambda scores: scores.notna().all())
+        self.scored = set(known[known].index)
+        # The score where it is known for a whole environment, else the return.
+        scored = self.parts.env.isin(self.scored)
+        self.parts["value"] = self.parts.score.where(scored, self.parts.return_mean)
+        self._numbers = itertools.count()
 
     def per_env(self, make: Callable[["Page", str], Block]) -> list[Block]:
         """A block for every environment."""
@@ -81,20 +59,17 @@ class Page:
 
     def of_env(self, table: pd.DataFrame, env: str) -> pd.DataFrame:
         """Rows of compared runs in one environment."""
-        return table[(table.env == env) & table["run"].isin(self.compared["run"])]
+        return table[(table.env == env) & table["run"].isin(self.runs["run"])]
 
-    def panel(
-        self, title: str, draw: Callable[[Axes], None], label: str, **size: Any
-    ) -> dict[str, Any]:
+    def panel(self, title: str, draw: Callable[[Axes], None], env: str, **size: Any) -> Block:
         """A figure with its title."""
-        name = f"figure-{next(self.counter)}"
+        name, label = f"figure-{next(self._numbers)}", f"{title}, {env}"
         return {"title": title, "svg": figures.panel(draw, name=name, label=label, **size)}
 
-    def line(self, label: str, *cells: Cell, below: str = "") -> dict[str, Any]:
+    def line(self, label: str, *cells: Any, below: str = "") -> Block:
         """A line of a table; one of a compared label begins with its symbol, and hides with it."""
         series = list(self.looks).index(label) if label in self.looks else None
-        first = {**_cell(label, below), "series": series}
-        return {"series": series, "cells": [first, *cells]}
+        return {"series": series, "cells": [(label, below), *cells]}
 
 
 def write_report(runs: Sequence[str | Path], out: str | Path = "report.html") -> Path:
@@ -113,56 +88,39 @@ def write_report(runs: Sequence[str | Path], out: str | Path = "report.html") ->
     """
     if not runs:
         raise ConfigError("no run is given, allowed: one or more run directories.")
-    page = Page.of(tables.read_runs(runs))
-    members = page.found.assignments
-    heads = 1 + int(members["head"].max()) if len(members) else 1
-    sections = [
-        {"name": "results", "blocks": _results(page)},
-        {"name": "learning-curves", "blocks": page.per_env(_curves)},
-        {"name": "physics", "blocks": page.per_env(_physics)},
-        {"name": "improvement", "blocks": [_improvement(page)]},
-        {
-            "name": "head-shares",
-            "legend": [f"head {head}" for head in range(min(heads, len(figures.HEADS)))],
-            "blocks": page.per_env(_head_shares),
-        },
-        {"name": "prediction-error", "blocks": page.per_env(_prediction_error)},
-        {"name": "settings", "blocks": page.per_env(_settings)},
-        {"name": "times", "blocks": page.per_env(_times)},
-        {"name": "runs", "blocks": [_runs(page)]},
-        {"name": "numbers", "blocks": [_numbers(page)]},
-    ]
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("headway", "lab"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )  # fmt: skip
+    page = Page(tables.read_runs(runs))
+    blocks = {
+        "results": _results(page),
+        "learning-curves": page.per_env(_curves),
+        "physics": page.per_env(_physics),
+        "improvement": [_improvement(page)],
+        "head-shares": page.per_env(_head_shares),
+        "prediction-error": page.per_env(_prediction_error),
+        "settings": page.per_env(_settings),
+        "times": page.per_env(_times),
+        "runs": [_runs(page)],
+        "numbers": [_numbers(page)],
+    }
 
-    def symbol(label: str) -> Callable[[Axes], None]:
-        """A piece of line with one marker."""
+    def symbol(axes: Axes, look: dict[str, Any]) -> None:
+        """Draw a piece of line with one marker."""
+        axes.plot([0, 1, 2], [0, 0, 0], **{**look, "gid": None, "markersize": 5, "markevery": [1]})
+        axes.set_axis_off()
+        axes.margins(0.02, 0.5)
 
-        def draw(axes: Axes) -> None:
-            look = {**page.looks[label], "gid": None, "markersize": 5, "markevery": [1]}
-            axes.plot([0, 1, 2], [0, 0, 0], **look)
-            axes.set_axis_off()
-            axes.margins(0.02, 0.5)
-
-        return draw
-
-    labels = list(page.looks)
-    title = " and ".join(filter(None, [", ".join(labels[:-1]), labels[-1]]))
-    text = environment.get_template("report.html.jinja").render(
-        title=title if len(labels) <= 4 else f"{len(labels)} methods compared",
+    text = render(
+        "report.html.jinja",
         envs=page.envs,
-        count=len(page.compared),
-        labels=labels,
-        symbols=[page.panel("", symbol(i), "", size=(0.42, 0.16))["svg"] for i in labels],
+        count=len(page.runs),
+        labels=list(page.looks),
+        symbols=[
+            page.panel("", partial(symbol, look=look), "", size=(0.42, 0.16))["svg"]
+            for look in page.looks.values()
+        ],
         notes=page.found.notes,
-        sections=sections,
+        blocks=blocks,
         theme=figures.THEME,
-        heads=len(figures.HEADS),
+        heads=min(page.found.assignments["head"].nunique(), len(figures.HEADS)),
         version=headway.__version__,
         command=shlex.join(["headway", "report", *map(str, runs), "-o", str(out)]),
         svg=Markup,
@@ -171,27 +129,45 @@ def write_report(runs: Sequence[str | Path], out: str | Path = "report.html") ->
     return Path(out)
 
 
-def _cell(text: str, *below: str, kind: str = "text") -> Cell:
-    return {"text": text, "below": [text for text in below if text], "kind": kind}
+def render(template: str, **values: Any) -> str:
+    """Fill in a template of this folder."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("headway", "lab"),
+        autoescape=jinja2.select_autoescape(["html.jinja"]),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    return environment.get_template(template).render(values)
 
 
-def _number(value: float, form: str) -> str:
-    return form.format(value).replace("-", "−")
+def _number(value: float, form: str = "{:.2f}") -> str:
+    return "–" if np.isnan(value) else form.format(value).replace("-", "−")
 
 
 def _estimate(found: statistics.Estimate | None, form: str = "{:.2f}", below: str = "") -> Cell:
     """A value with its interval below."""
     if found is None:
-        return _cell("–", kind="number")
+        return "–"
     ends = " to ".join(_number(end, form) for end in found.interval or ())
-    return _cell(_number(found.value, form), ends, below, kind="number")
+    return _number(found.value, form), ends, below
 
 
-def _matrix(parts: pd.DataFrame, label: str, column: str) -> pd.DataFrame:
-    """Means over physics of one label: a line per run, a column per group, training first."""
-    own = parts[parts.label == label]
-    matrix = own.groupby(["run", "group"], sort=False)[column].mean().unstack("group")
-    return matrix[sorted(matrix.columns, key=lambda group: group != TRAIN)]
+def _table(columns: Sequence[str], lines: Sequence[Block], numbers: Sequence[int] = ()) -> Block:
+    """A table; `numbers` are the places of columns that stand on the right."""
+    return {"columns": columns, "lines": lines, "numbers": numbers}
+
+
+def _groups(table: pd.DataFrame) -> list[str]:
+    """Groups of physics, training first."""
+    return sorted(table.group.unique(), key=lambda group: group != TRAIN)
+
+
+def _matrix(parts: pd.DataFrame, label: str, column: str = "value") -> pd.DataFrame:
+    """Means over physics of one label: a line per run, a column per group of any label."""
+    own = parts[parts.label == label].groupby(["run", "group"], sort=False)[column].mean()
+    return own.unstack("group").reindex(columns=_groups(parts))
 
 
 def _unlike(page: Page, env: str | None = None) -> list[str]:
@@ -209,75 +185,63 @@ def _results_of(page: Page, env: str) -> Block:
     own = page.of_env(page.parts, env)
     if own.empty:
         return {"texts": ["No run is finished yet."]}
-    groups = sorted(own.group.unique(), key=lambda group: group != TRAIN)
     form = "{:.2f}" if env in page.scored else "{:,.1f}"
     lines = []
-    for label in page.looks:
-        if label not in set(own.label):
-            continue
-        values = _matrix(own, label, "value").reindex(columns=groups)
-        returns = _matrix(own, label, "return_mean").reindex(columns=groups)
-        cells = []
-        for group in groups:
+    for label in (label for label in page.looks if label in set(own.label)):
+        values, returns = _matrix(own, label), _matrix(own, label, "return_mean")
+        cells: list[Cell] = []
+        for group in values:
             column, below = values[[group]].dropna().to_numpy(), ""
             if env in page.scored and len(column):
                 below = f"return {_number(returns[group].mean(), '{:,.0f}')}"
                 below += f" ± {returns[group].std():,.0f}" if len(column) > 1 else ""
             cells.append(
-                _estimate(statistics.estimate([column]) if len(column) else None, form, below)
+                _estimate(statistics.estimate([column]), form, below) if len(column) else "–"
             )
         seeds = f"{len(values)} seed{'s' * (len(values) != 1)}"
         lines.append(page.line(label, *cells, below=seeds))
     references = page.found.runs[page.found.runs.is_reference & (page.found.runs.env == env)]
-    texts = ["Returns: no references are known for all of these physics."]
+    text = "Returns: no references are known for all of these physics."
     if env in page.scored:
         own_runs = set(references.method) == set(tables.REFERENCES)
         by = "the runs of random and true-dynamics given here"
-        texts = [f"Scores are normalised by {by if own_runs else 'the reference returns'}."]
-    columns = ["method", *map(group_label, groups)]
-    return {"table": {"columns": columns, "lines": lines}, "texts": texts + _unlike(page, env)}
+        text = f"Scores are normalised by {by if own_runs else 'the reference returns'}."
+    columns = ["method", *map(group_label, _groups(own))]
+    table = _table(columns, lines, range(1, len(columns)))
+    return {"table": table, "texts": [text, *_unlike(page, env)]}
 
 
 def _results(page: Page) -> list[Block]:
-    blocks = []
-    if len(page.envs) > 1 and set(page.envs) == set(page.scored):
-        unseen, lines = page.parts[page.parts.group != TRAIN], []
+    blocks, remarks, lines = [], _unlike(page), []
+    if len(page.envs) > 1 and set(page.envs) == page.scored:
+        unseen = page.parts[page.parts.group != TRAIN]
         for label in page.looks:
-            own = [_matrix(unseen[unseen.env == env], label, "value") for env in page.envs]
-            wanted = [set(unseen[unseen.env == env].group) for env in page.envs]
-            whole = all(
-                set(matrix) == groups and matrix.notna().all(axis=None) and len(matrix)
-                for matrix, groups in zip(own, wanted, strict=True)
-            )
-            if whole:
+            own = [_matrix(unseen[unseen.env == env], label) for env in page.envs]
+            if all(len(matrix) and matrix.notna().all(axis=None) for matrix in own):
                 found = statistics.estimate([matrix.to_numpy() for matrix in own])
                 lines.append(page.line(label, _estimate(found), below=f"{found.num_runs} seeds"))
-        remarks = _unlike(page)
-        columns = ["method", "score on unseen physics"]
-        table = {"columns": columns, "lines": [] if remarks else lines}
+        table = _table(["method", "score on unseen physics"], [] if remarks else lines, [1])
         blocks.append({"title": "All environments", "table": table, "texts": remarks})
     counts = page.parts.groupby(["label", "env"], sort=False)["run"].nunique()
     few = [f"{label} on {env} ({n})" for (label, env), n in counts.items() if n < 3]  # type: ignore
-    texts = [
-        f"Fewer than {statistics.MIN_RUNS} finished seeds: {'; '.join(few)}. No interval is given"
-        " for them, and no difference is claimed."
-    ]
-    narrow = [statistics.caution(min(counts))] if len(counts) else []
-    return [*blocks, *page.per_env(_results_of), {"texts": texts * bool(few) + narrow}]
+    texts = [statistics.caution(min(counts))] if len(counts) else []
+    if few:
+        text = f"Fewer than {statistics.MIN_RUNS} finished seeds: {'; '.join(few)}."
+        texts.insert(0, f"{text} No interval is given for them, and no difference is claimed.")
+    return [*blocks, *page.per_env(_results_of), {"texts": texts}]
 
 
 def _curves(page: Page, env: str) -> Block:
     own = page.of_env(page.found.curves, env)
     own = own.assign(finished=own["run"].isin(page.found.finished))
-    references = page.found.final
-    is_reference = page.found.runs.loc[page.found.runs.is_reference, "run"]
-    levels = tables.by_group(references[references["run"].isin(is_reference)])
+    references = ~page.found.final["run"].isin(page.runs["run"])
+    levels = tables.by_group(page.found.final[references & (page.found.final.env == env)])
     panels, once = [], []
-    for group, table in own.groupby("group", sort=False):
+    for group in sorted(own.group.unique(), key=lambda group: group != COLLECTED):
+        table, here = own[own.group == group], levels[levels.group == group]
         if not table.duplicated("run").any():
-            once.append(group_label(str(group)))
+            once.append(group_label(group))
             continue
-        here = levels[(levels.env == env) & (levels.group == group)]
 
         def draw(axes: Axes, table: pd.DataFrame = table, here: pd.DataFrame = here) -> None:
             figures.curves(axes, table, page.looks)
@@ -286,11 +250,9 @@ def _curves(page: Page, env: str) -> Block:
                 axes.axhline(level, color=figures.FAINT, linewidth=1, linestyle=":")
                 axes.text(0.995, level, str(method), transform=axes.get_yaxis_transform(), **style)
 
-        label = f"Return over environment steps on {env}, {group}"
-        panels.append((group != COLLECTED, page.panel(group_label(str(group)), draw, label)))
-    panels.sort(key=lambda found: found[0])
+        panels.append(page.panel(group_label(group), draw, env))
     texts = [f"Measured after one iteration at most, so no curve: {'; '.join(once)}."]
-    return {"panels": [panel for _, panel in panels], "texts": texts * bool(once)}
+    return {"panels": panels, "texts": texts * bool(once)}
 
 
 def _physics(page: Page, env: str) -> Block:
@@ -299,24 +261,13 @@ def _physics(page: Page, env: str) -> Block:
         return {"texts": ["No run is finished yet."]}
     name = "score" if env in page.scored else "return per episode"
     shown = {label: look for label, look in page.looks.items() if label in set(own.label)}
-    label = f"{name} by physics on {env}"
-    physics = page.panel(
-        f"{name} by physics",
-        lambda axes: figures.by_physics(axes, own, shown, name, joined=True),
-        label,
-        size=(3.5, 2.9),
-    )
-    panels = [physics]
-    for group in sorted(own.group.unique(), key=lambda group: group != TRAIN):
+    draw = partial(figures.by_physics, table=own, looks=shown, name=name, joined=True)
+    panels = [page.panel(f"{name} by physics", draw, env, size=(3.7, 3.05))]
+    for group in _groups(own):
         values = own[own.group == group].groupby(["label", "run"]).value.mean().reset_index()
-        panels.append(
-            page.panel(
-                group_label(group),
-                lambda axes, values=values: figures.dots(axes, values, shown, name),
-                f"{name} of each method on {env}, {group}",
-                size=(3.5, 0.85 + 0.25 * len(shown)),
-            )
-        )
+        draw = partial(figures.dots, table=values, looks=shown, name=name)
+        size = (3.7, 0.9 + 0.265 * len(shown))
+        panels.append(page.panel(group_label(group), draw, env, size=size))
     return {"panels": panels}
 
 
@@ -329,25 +280,20 @@ def _improvement(page: Page) -> Block:
             ends = shown.interval and (1 - shown.interval[1], 1 - shown.interval[0])
             found[first, second] = shown
             found[second, first] = dataclasses.replace(shown, value=1 - shown.value, interval=ends)
+    if not found:
+        one = "There is one method only: nothing to compare."
+        none = "No two methods were tested on the same unseen physics."
+        return {"texts": [one if len(labels) == 1 else none, *_unlike(page)]}
     lines = [
         page.line(first, *(_estimate(found.get((first, second))) for second in labels))
         for first in labels
     ]
-    claims = [
-        statistics.verdict(one, other, shown)
-        for (one, other), shown in found.items()
-        if one == labels[0]
-    ]
-    block: Block = {
-        "table": {"columns": ["", *labels], "lines": lines},
-        "claims": claims,
-        "texts": [statistics.caution(min(e.num_runs for e in found.values()))] if found else [],
+    pairs = [(*pair, shown) for pair, shown in found.items() if pair[0] == labels[0]]
+    return {
+        "table": _table(["", *labels], lines, range(1, len(labels) + 1)),
+        "claims": [statistics.verdict(*pair) for pair in pairs],
+        "texts": [statistics.caution(min(e.num_runs for e in found.values())), *_unlike(page)],
     }
-    if not found:
-        one = "There is one method only: nothing to compare."
-        none = "No two methods were tested on the same unseen physics."
-        block = {"texts": [one if len(labels) == 1 else none]}
-    return {**block, "texts": block["texts"] + _unlike(page)}
 
 
 def _head_shares(page: Page, env: str) -> Block:
@@ -355,88 +301,69 @@ def _head_shares(page: Page, env: str) -> Block:
     for _, own in page.of_env(page.found.assignments, env).groupby("run", sort=False):
         if own["head"].nunique() > 1:
             title = f"{own.label.iloc[0]}, seed {own.seed.iloc[0]}"
+            size = (3.7, 0.8 + 0.25 * own.sim_params.nunique())
             panels.append(
-                page.panel(
-                    title,
-                    lambda axes, own=own: figures.head_shares(axes, own),
-                    f"Head shares of {title} on {env}",
-                    size=(3.5, 0.75 + 0.24 * own.sim_params.nunique()),
-                )
+                page.panel(title, partial(figures.head_shares, table=own), env, size=size)
             )
     return {"panels": panels, "texts": [] if panels else ["No method with several heads."]}
 
 
 def _prediction_error(page: Page, env: str) -> Block:
     own = page.of_env(page.found.errors, env)
-    own = own[np.isfinite(own.error)]
-    groups = sorted(own.group.unique(), key=lambda group: group != TRAIN)
-    panels = [
-        page.panel(
-            group_label(group),
-            lambda axes, group=group: figures.error_lines(
-                axes, own[own.group == group], page.looks
-            ),
-            f"Prediction error by imagined step on {env}, {group}",
-        )
-        for group in groups
-    ]
+    own, panels = own[np.isfinite(own.error)], []
+    for group in _groups(own):
+        draw = partial(figures.error_lines, table=own[own.group == group], looks=page.looks)
+        panels.append(page.panel(group_label(group), draw, env))
     return {"panels": panels, "texts": [] if panels else ["No prediction errors."]}
 
 
 def _settings(page: Page, env: str) -> Block:
-    first = page.of_env(page.found.runs, env).drop_duplicates("label").set_index("label")["run"]
-    settings = {label: page.found.settings[run] for label, run in first.items()}
-    names = tables.differing(list(settings.values()), unless=("method", "seed"))
+    first = page.of_env(page.runs, env).drop_duplicates("label").set_index("label")["run"]
+    settings = {str(label): page.found.settings[run] for label, run in first.items()}
     lines = []
-    for name in names:
-        values = (_cell(tables.value_text(table.get(name))) for table in settings.values())
-        lines.append({"series": None, "cells": [_cell(name, kind="code"), *values]})
-    columns = ["setting", *map(str, settings)]
-    texts = [] if names else ["All runs have the same settings."]
-    return {"table": {"columns": columns, "lines": lines}, "texts": texts}
+    for name in tables.differing(list(settings.values()), unless=("method", "seed")):
+        values = (tables.value_text(table.get(name)) for table in settings.values())
+        lines.append({"series": None, "cells": [name, *values]})
+    texts = [] if lines else ["All runs have the same settings."]
+    return {"table": {**_table(["setting", *settings], lines), "code": 0}, "texts": texts}
 
 
 def _times(page: Page, env: str) -> Block:
-    own = page.of_env(page.found.runs, env)
+    own = page.of_env(page.runs, env)
     own = own[own["run"].isin(page.found.finished)]
     means = own.groupby("label", sort=False)[list(PHASES)].mean()
     longest = max(means.sum(axis=1), default=0) or 1.0
     lines = []
     for label, minutes in means.iterrows():
         device = ", ".join(sorted(own.device[own.label == label].unique()))
-        numbers = [_cell(f"{value:,.1f}", kind="number") for value in [*minutes, minutes.sum()]]
-        bar = {**_cell("", kind="bar"), "widths": [100 * value / longest for value in minutes]}
-        lines.append(page.line(str(label), *numbers, bar, _cell(device)))
+        numbers = [_number(value, "{:,.1f}") for value in (*minutes, minutes.sum())]
+        bar = {"widths": [100 * value / longest for value in minutes]}
+        lines.append(page.line(str(label), *numbers, bar, device))
     columns = ["method", *(f"{phase}, min" for phase in PHASES), "all, min", "", "device"]
     texts = [] if lines else ["No run is finished yet."]
-    return {"table": {"columns": columns, "lines": lines}, "texts": texts}
+    return {"table": _table(columns, lines, range(1, 5)), "texts": texts}
 
 
 def _runs(page: Page) -> Block:
     lines = []
     for run in page.found.runs.itertuples():
         label = f"{run.label} (reference)" if run.is_reference else str(run.label)
-        done = _cell(f"{run.iterations} of {run.planned}", kind="number")
-        seed = _cell(str(run.seed), kind="number")
-        cells = (_cell(str(run.env)), seed, done, _cell(str(run.preset)))
-        lines.append(page.line(label, *cells, _cell(str(run.run), kind="code")))
+        done = f"{run.iterations} of {run.planned}"
+        lines.append(page.line(label, run.env, str(run.seed), done, run.preset, run.run))
     columns = ["method", "environment", "seed", "iterations", "preset", "directory"]
-    return {"table": {"columns": columns, "lines": lines}}
+    return {"table": {**_table(columns, lines, (2, 3)), "code": 5}}
 
 
 def _numbers(page: Page) -> Block:
     table = tables.by_physics(page.found.final)[RAW_COLUMNS].round(4)
     lines = []
-    for row in table.itertuples(index=False):
-        env, label, seed, group, physics, episodes, mean, std, score, _ = row
-        numbers = [_number(value, "{:,.2f}") for value in (mean, std)]
-        numbers.append("–" if np.isnan(score) else _number(score, "{:.3f}"))
-        texts = [_cell(str(text)) for text in (env, seed, group, physics, episodes)]
-        lines.append(page.line(label, *texts, *(_cell(text, kind="number") for text in numbers)))
+    for env, label, *texts, mean, std, score, _ in table.itertuples(index=False):
+        numbers = _number(mean, "{:,.2f}"), _number(std, "{:,.2f}"), _number(score, "{:.3f}")
+        lines.append(page.line(label, env, *map(str, texts), *numbers))
     columns = [
         "method", "environment", "seed", "group", "physics", "episodes", "mean return",
         "standard deviation", "score",
     ]  # fmt: skip
     csv = table.rename(columns={"label": "method"}).to_csv(index=False)
     link = base64.b64encode(csv.encode()).decode()
-    return {"table": {"columns": columns, "lines": lines}, "csv": link}
+    return {"table": _table(columns, lines, range(6, 9)), "csv": link}

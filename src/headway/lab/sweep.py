@@ -20,7 +20,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -29,6 +29,7 @@ from headway.config import Config, differences, flatten, from_dict, to_dict, tol
 from headway.errors import BusyError, ConfigError, HeadwayError, RunError
 from headway.lab.paper import Experiment, Settings
 from headway.task import env_spec
+from headway.training.files import reading
 from headway.training.methods import make_config
 from headway.training.progress import make_progress
 from headway.training.run import RunDir
@@ -44,12 +45,7 @@ FAREWELL = 15.0  # seconds that interrupted runs on Ray get to save
 GPU_MEMORY = 0.9  # share of a GPU's memory for all runs on it
 
 
-class Cell(NamedTuple):
-    """A place in the table of an experiment."""
-
-    env: str
-    arm: str
-    seed: int
+Cell = tuple[str, str, int]  # a place in the table of an experiment: environment, arm, seed
 
 
 class State(NamedTuple):
@@ -137,7 +133,7 @@ class Comparison:
                     names = {"method": arm.method, "preset": self.preset, "seed": seed}
                     changes = {**self.settings, **arm.settings}
                     config = make_config(env, **names, settings=changes)
-                    found[Cell(env, arm.label, seed)] = Job.of(config, self.out)
+                    found[env, arm.label, seed] = Job.of(config, self.out)
         return found
 
     @property
@@ -156,22 +152,17 @@ class Comparison:
     def folder(self) -> Path:
         """Folder of results: those of a comparison that this one contains are replaced."""
         facts, usual = self.facts, self.out / f"{self.experiment.name}-{self.preset}"
-        before = facts
+        before: dict[str, Any] = facts
         if (usual / NOTE).exists():
-            try:
+            with reading(usual / NOTE):
                 before = dict(json.loads((usual / NOTE).read_bytes()))
-            except (ValueError, TypeError, RecursionError) as error:
-                raise RunError(
-                    f"{usual / NOTE} is damaged ({error}), expected what its folder compares; move"
-                    " the folder away, or choose another --out."
-                ) from None
-        for name, value in facts.items():
-            old = before.get(name, [None])
-            if old != value and not (name in GROWING and all(one in value for one in old)):
-                text = json.dumps(facts, sort_keys=True)
-                digest = hashlib.sha256(text.encode()).hexdigest()[:10]
-                return usual.with_name(f"{usual.name}-{digest}")
-        return usual
+        grown = (
+            before.get(name) == value
+            or (name in GROWING and all(one in value for one in before.get(name, [None])))
+            for name, value in facts.items()
+        )
+        digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:10]
+        return usual if all(grown) else usual.with_name(f"{usual.name}-{digest}")
 
 
 def fingerprint(config: Config) -> str:
@@ -246,23 +237,23 @@ def run_jobs(jobs: Sequence[Job], workers: Workers, *, quiet: bool = True) -> di
     say(f"{len(waiting)} runs are missing")
     if not waiting:
         return failures
-    if workers.one_by_one or not (find_spec("ray") or workers.address):
-        pool = _Processes(quiet)
-    else:
-        pool = _RayTasks(workers)
+    here = workers.one_by_one or not (find_spec("ray") or workers.address)
     running: dict[Any, Job] = {}
     losses: Counter[tuple[Path, int]] = Counter()
-    with pool, stop_requests() as stop:
+    pool = _processes(running, quiet) if here else _ray_tasks(running, workers)
+    with pool as (submit, wait), stop_requests() as stop:
         while waiting or running:
             now = time.monotonic()
-            for one in [one for one in waiting if one[0] <= now][: pool.room - len(running)]:
+            for one in [one for one in waiting if one[0] <= now]:
+                if here and running:
+                    break
                 waiting.remove(one)
                 say(f"{one[1].name}: running")
-                running[pool.submit(one[1])] = one[1]
-            ended = pool.wait(list(running)) if running else time.sleep(POLL)
-            for task in ended or ():
-                job = running.pop(task)
-                outcome, note = pool.result(task)
+                running[submit(one[1])] = one[1]
+            if not running:
+                time.sleep(POLL)
+            for task, *ended in wait():
+                job, (outcome, note) = running.pop(task), ended
                 if outcome == "lost":
                     place = job.path, job.state.iterations
                     losses[place] += 1
@@ -306,26 +297,17 @@ def reason(error: BaseException) -> str:
     return text if isinstance(error, HeadwayError) else f"{type(error).__name__}: {text[:500]}"
 
 
-class _Processes:
-    """Runs in processes of their own, one at a time."""
+# Begins a task; waits for a while and yields tasks that ended, with `done`, `failed`, `busy` or
+# `lost`, and why.
+Pool = tuple[Callable[[Job], Any], Callable[[], Iterator[Any]]]
 
-    room = 1
 
-    def __init__(self, quiet: bool):
-        self._quiet = quiet
-        self._process: subprocess.Popen[str] | None = None
+@contextlib.contextmanager
+def _processes(running: Mapping[Any, Job], quiet: bool) -> Iterator[Pool]:
+    """Runs in processes of their own; those that still go on at the end save what they have."""
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        """Let a run that still goes on save what it has."""
-        if self._process:
-            self._process.terminate()
-            self._process.communicate()
-
-    def submit(self, job: Job) -> Any:
-        self._process = subprocess.Popen(
+    def submit(job: Job) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
             [sys.executable, "-c", "from headway.lab import sweep; sweep.child()"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -333,20 +315,24 @@ class _Processes:
             env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
             start_new_session=True,  # Ctrl-C reaches the driver alone, which passes it on once
         )
-        work = json.dumps(to_dict(job.config)), str(job.path), self._quiet
-        print(json.dumps(work), file=self._process.stdin, flush=True)
-        return self._process
+        work = json.dumps(to_dict(job.config)), str(job.path), quiet
+        print(json.dumps(work), file=process.stdin, flush=True)
+        return process
 
-    def wait(self, tasks: list[Any]) -> list[Any]:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            tasks[0].wait(POLL)
-            return tasks
-        return []
+    def wait() -> Iterator[Any]:
+        for process in list(running):
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(POLL)
+                said, _ = process.communicate()
+                lost = "lost", f"its process ended with {process.returncode}"
+                yield process, *(json.loads(said) if said else lost)
 
-    def result(self, task: Any) -> tuple[str, str]:
-        said, _ = task.communicate()
-        self._process = None
-        return json.loads(said) if said else ("lost", f"its process ended with {task.returncode}")
+    try:
+        yield submit, wait
+    finally:
+        for process in running:
+            process.terminate()
+            process.communicate()
 
 
 def child() -> None:
@@ -364,48 +350,43 @@ def child() -> None:
     print(json.dumps(make_run(config, path, quiet)))
 
 
-class _RayTasks:
+@contextlib.contextmanager
+def _ray_tasks(running: Mapping[Any, Job], workers: Workers) -> Iterator[Pool]:
     """Runs as Ray tasks, as many side by side as the machine or cluster holds.
 
     Ray itself never repeats a task, so a driver has at most one task per run directory.
     """
+    try:
+        import ray.exceptions
 
-    room = 10**6
+        ours = not ray.is_initialized()  # a connection that is open already is used
+        if ours:
+            os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+            quietly: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
+            if workers.address is None:
+                quietly["include_dashboard"] = False
+            ray.init(workers.address or "local", **quietly)
+    except (ImportError, ConnectionError, ValueError, RuntimeError) as error:
+        raise ConfigError(
+            f"Ray at {workers.address or 'this machine'} cannot be used ({reason(error)}); install"
+            " headway[ray], start a cluster with `ray start --head` and the same versions"
+            " everywhere, or choose --one-by-one."
+        ) from None
+    of_ray = ray.exceptions
 
-    def __init__(self, workers: Workers):
-        self._workers = workers
-        self._running: list[Any] = []
+    def wait() -> Iterator[Any]:
+        for task in ray.wait(list(running), timeout=POLL)[0] if running else ():
+            try:
+                yield task, *ray.get(task)
+            except (of_ray.TaskUnschedulableError, of_ray.RuntimeEnvSetupError) as error:
+                yield task, "failed", reason(error)
+            except of_ray.RayError as error:
+                lost = not isinstance(error, of_ray.RayTaskError)
+                yield task, "lost" if lost else "failed", f"its worker died ({reason(error)})"
 
-    def __enter__(self) -> Self:
-        try:
-            import ray.exceptions
-
-            self._ours = not ray.is_initialized()  # a connection that is open already is used
-            if self._ours:
-                os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-                alone: dict[str, Any] = (
-                    {} if self._workers.address else {"include_dashboard": False}
-                )
-                where = self._workers.address or "local"
-                ray.init(where, logging_level=logging.ERROR, log_to_driver=False, **alone)
-        except (ImportError, ConnectionError, ValueError, RuntimeError) as error:
-            raise ConfigError(
-                f"Ray at {self._workers.address or 'this machine'} cannot be used"
-                f" ({reason(error)}); install headway[ray], start a cluster with `ray start"
-                " --head` and the same versions everywhere, or choose --one-by-one."
-            ) from None
-        self._ray = ray
-        try:
-            self._task: Any = ray.remote(**self._options())(make_run)
-        except ConfigError:
-            self.__exit__()
-            raise
-        return self
-
-    def _options(self) -> dict[str, Any]:
-        """Reservations of every task, and the environment of its process."""
-        cpus, gpus = self._workers.cpus_per_run, self._workers.gpus_per_run
-        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+    try:
+        cpus, gpus = workers.cpus_per_run, workers.gpus_per_run
+        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         if gpus is None:
             gpus = float(any(node.get("GPU") for node in nodes))
         if not any(node.get("CPU", 0) >= cpus and node.get("GPU", 0) >= gpus for node in nodes):
@@ -421,32 +402,16 @@ class _RayTasks:
             variables["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{GPU_MEMORY * gpus:.3f}"
         # A process per run, as if it were trained alone.
         once = {"max_retries": 0, "max_calls": 1, "runtime_env": {"env_vars": variables}}
-        return {"num_cpus": cpus, "num_gpus": gpus, **once}
+        make: Any = ray.remote(num_cpus=cpus, num_gpus=gpus, **once)(make_run)
 
-    def __exit__(self, *error: object) -> None:
-        """Let runs that still go on save what they have."""
-        for task in self._running:
-            self._ray.cancel(task)
-        if self._running:
-            self._ray.wait(self._running, num_returns=len(self._running), timeout=FAREWELL)
-        if self._ours:
-            self._ray.shutdown()
+        def submit(job: Job) -> Any:
+            return make.remote(json.dumps(to_dict(job.config)), str(job.path.absolute()))
 
-    def submit(self, job: Job) -> Any:
-        config = json.dumps(to_dict(job.config))
-        self._running.append(self._task.remote(config, str(job.path.absolute())))
-        return self._running[-1]
-
-    def wait(self, tasks: list[Any]) -> list[Any]:
-        return self._ray.wait(tasks, timeout=POLL)[0]
-
-    def result(self, task: Any) -> tuple[str, str]:
-        of_ray = self._ray.exceptions
-        self._running.remove(task)
-        try:
-            return self._ray.get(task)
-        except (of_ray.TaskUnschedulableError, of_ray.RuntimeEnvSetupError) as error:
-            return "failed", reason(error)
-        except of_ray.RayError as error:
-            lost = not isinstance(error, of_ray.RayTaskError)
-            return "lost" if lost else "failed", f"its worker died ({reason(error)})"
+        yield submit, wait
+    finally:
+        for task in running:  # each saves what it has
+            ray.cancel(task)
+        if running:
+            ray.wait(list(running), num_returns=len(running), timeout=FAREWELL)
+        if ours:
+            ray.shutdown()

@@ -4,9 +4,12 @@ Reads run directories and the tables kept in `results/`, whose settings may be o
 only what is needed is read, and damage costs one line.
 """
 
+import contextlib
 import dataclasses
+import itertools
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import operator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +17,6 @@ import numpy as np
 import pandas as pd
 from rich import box
 from rich.table import Table
-from rich.text import Text
 
 from headway.config import Config
 from headway.errors import RunError
@@ -29,14 +31,16 @@ PHASES = ("collect", "fit", "evaluate")
 UNITS = {"length": "m", "mass": "kg"}
 SERIES = ["env", "label", "seed", "run"]  # the keys of a run in every table
 
-_COLUMNS: dict[str, dict[str, type]] = {
-    "evaluation.csv": {
+_FILES: dict[str, tuple[str, str, dict[str, type]]] = {  # by table: file, loss without it, columns
+    "episodes": ("evaluation.csv", "no final result", {
         "iteration": int, "group": str, "sim_params": str, "episode": int, "return": float,
-    },
-    "assignments.csv": {
+    }),
+    "assignments": ("assignments.csv", "no head shares", {
         "iteration": int, "member": int, "head": int, "sim_params": str, "share": float,
-    },
-    "prediction_error.csv": {"iteration": int, "group": str, "step": int, "error": float},
+    }),
+    "errors": ("prediction_error.csv", "no prediction errors", {
+        "iteration": int, "group": str, "step": int, "error": float,
+    }),
 }  # fmt: skip
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError)
 _NO_VARIANT = ("env", "method", "preset", "seed", "collection.max_bad_episodes")
@@ -50,7 +54,8 @@ class Runs:
     """Tables of some runs; each line names its run by the columns `SERIES`."""
 
     runs: pd.DataFrame
-    """A line per run: method, preset, protocol, iterations, planned, device, minutes by phase."""
+    """A line per run: method and its place in the order of methods, preset, protocol, iterations,
+    planned, device, minutes by phase."""
     episodes: pd.DataFrame
     """Test episodes: iteration, group, sim_params, episode, return, score (NaN: unknown)."""
     curves: pd.DataFrame
@@ -79,24 +84,6 @@ class Runs:
         return found[found.iteration == found["run"].map(last) - 1]
 
 
-def find_runs(paths: Iterable[str | Path]) -> list[Path]:
-    """List run directories at or below some paths.
-
-    Raises:
-        RunError: A path is no directory, or holds no run.
-    """
-    found: dict[Path, None] = {}
-    for path in map(Path, paths):
-        if not path.is_dir():
-            raise RunError(f"{path} is not a directory, allowed: run directories or folders.")
-        here = [path] if (path / "config.json").exists() else []
-        below = here or sorted(file.parent for file in path.rglob("config.json"))
-        if not below:
-            raise RunError(f"{path} holds no run, allowed: run directories or folders of them.")
-        found |= dict.fromkeys(below)
-    return list(found)
-
-
 def read_runs(paths: Iterable[str | Path]) -> Runs:
     """Read runs; whatever is damaged or unfinished is noted in one line.
 
@@ -110,108 +97,89 @@ def read_runs(paths: Iterable[str | Path]) -> Runs:
         RunError: A path is no directory, or nothing there is a run that can be read.
     """
     notes: list[tuple[str, str]] = []
-    found = find_runs(paths)
+    found: dict[Path, None] = {}
+    for path in map(Path, paths):
+        if not path.is_dir():
+            raise RunError(f"{path} is not a directory, allowed: run directories or folders.")
+        below = sorted(file.parent for file in path.rglob("config.json"))
+        if not below:
+            raise RunError(f"{path} holds no run, allowed: run directories or folders of them.")
+        found.update(dict.fromkeys([path] if path in below else below))
     read = [run for path in found if (run := _read_run(path, notes)) is not None]
     if not read:
         raise RunError(f"none of {len(found)} runs can be read: {notes[0][1]}")
-    order = [*METHODS, *sorted({run["facts"]["method"] for run in read} - {*METHODS})]
-    read.sort(
-        key=lambda run: (
-            run["facts"]["env"],
-            order.index(run["facts"]["method"]),
-            run["facts"]["seed"],
-            -run["facts"]["iterations"],
-            run["facts"]["run"],
-        )
-    )
+    read.sort(key=lambda run: (-run["iterations"], run["run"]))
+    read.sort(key=operator.itemgetter("env", "order", "method", "seed"))
     kept: dict[str, dict[str, Any]] = {}
     for run in read:
         name = json.dumps({k: v for k, v in run["settings"].items() if k != _NO_VARIANT[-1]})
         first = kept.setdefault(name, run)
         if first is not run:
-            same = f"left out: same settings and seed as {first['facts']['run']}."
-            notes.append((run["facts"]["run"], same))
-    settings = {run["facts"]["run"]: run["settings"] for run in kept.values()}
-    runs = pd.DataFrame([run["facts"] for run in kept.values()])
+            notes.append((run["run"], f"left out: same settings and seed as {first['run']}."))
+    settings = {run["run"]: run.pop("settings") for run in kept.values()}
+    joined = {
+        name: pd.concat([run.pop(name).assign(run=run["run"]) for run in kept.values()])
+        for name in ("curves", "collected", *_FILES)
+    }
+    runs = pd.DataFrame(list(kept.values()))
     runs["label"] = _labels(runs, settings)
-    runs = runs.sort_values("env", kind="stable", ignore_index=True)
     names = runs[[*SERIES, "method", "protocol"]]
-
-    def together(name: str) -> pd.DataFrame:
-        tables = pd.concat([run[name] for run in kept.values()], ignore_index=True)
-        return names.merge(tables, on="run")
-
-    episodes = together("episodes")
-    made = Runs(
-        runs, episodes, together("curves"), together("collected"), together("assignments"),
-        together("errors"), settings, notes,
-    )  # fmt: skip
-    episodes["score"] = _scores(made)
+    merged = {name: names.merge(table, on="run") for name, table in joined.items()}
+    made = Runs(runs, **merged, settings=settings, notes=notes)
+    made.episodes["score"] = _scores(made)
     return made
 
 
 def _read_run(path: Path, notes: list[tuple[str, str]]) -> dict[str, Any] | None:
-    def attempt(read: Callable[[], Any], instead: Any, lost: str) -> Any:
+    """Facts, settings and tables of a run; None where not even its settings can be read."""
+
+    @contextlib.contextmanager
+    def noted(lost: str) -> Iterator[None]:
         try:
-            return read()
+            yield
+        except FileNotFoundError:
+            pass
         except _DAMAGE as error:
             reason = f"{type(error).__name__} {error}".splitlines()[0]
             notes.append((str(path), f"{lost}: {reason[:200]}"))
-            return instead
 
-    def table(name: str, lost: str) -> pd.DataFrame:
-        empty = pd.DataFrame({c: pd.Series(dtype=kind) for c, kind in _COLUMNS[name].items()})
-        return attempt(lambda: _read_table(path / name), empty, lost).assign(run=str(path))
-
-    def read_config() -> tuple[dict[str, Any], dict[str, Any]]:
+    run = {"run": str(path), **_summaries("")}
+    with noted("left out"):
         content = json.loads((path / "config.json").read_bytes())
-        config = _flatten(content.get("config", content))
-        return config, {
-            "run": str(path),
-            "env": str(config["env"]),
-            "method": str(config["method"]),
-            "preset": str(config.get("preset", "?")),
-            "seed": int(config["seed"]),
+        settings = _flatten(content.get("config", content))
+        run |= {
+            "env": str(settings["env"]),
+            "method": str(settings["method"]),
+            "order": [*METHODS, settings["method"]].index(settings["method"]),
+            "preset": str(settings.get("preset", "?")),
+            "seed": int(settings["seed"]),
             "device": str(content.get("device", "?")),
-            "protocol": _protocol(config),
+            "protocol": _protocol(settings),
+            "settings": settings,
         }
-
-    settings, facts = attempt(read_config, (None, None), "left out")
-    if facts is None:
+    if "settings" not in run:
         return None
-    nothing = pd.DataFrame(columns=["iteration", "group"])
-    lines, curves, collected = attempt(
-        lambda: _read_metrics(path / "metrics.jsonl"),
-        ([], nothing, nothing),
-        "no curve, times or final result",
-    )
-    planned = int(settings.get("collection.num_iterations", len(lines)))
-    minutes = {p: sum(line["seconds"].get(p, 0.0) for line in lines) / 60 for p in PHASES}
-    facts |= {"iterations": len(lines), "planned": planned, **minutes}
-    episodes = table("evaluation.csv", "no final result")
-    if len(lines) < planned:
-        done = f"{len(lines)} of {planned} iterations are finished"
-        notes.append((str(path), f"{done}: it is in the curves, not in the final results."))
-    elif planned - 1 not in set(episodes.iteration):
+    with noted("no curve, times or final result"):
+        run |= _summaries((path / "metrics.jsonl").read_text())
+    for name, (file, lost, kinds) in _FILES.items():
+        run[name] = pd.DataFrame({c: pd.Series(dtype=kind) for c, kind in kinds.items()})
+        with noted(lost):
+            table = _read_table(path / file, kinds)
+            newest = table.iteration == table.iteration.max()
+            run[name] = table if name == "episodes" else table[newest]
+    done = run["iterations"]
+    planned = run["planned"] = int(run["settings"].get("collection.num_iterations", done))
+    if done < planned:
+        text = f"{done} of {planned} iterations are finished"
+        notes.append((str(path), f"{text}: it is in the curves, not in the final results."))
+    elif planned - 1 not in set(run["episodes"].iteration):
         notes.append((str(path), "no test episodes after the last iteration: no final result."))
-    return {
-        "facts": facts,
-        "settings": settings,
-        "episodes": episodes,
-        "curves": curves.assign(run=str(path)),
-        "collected": collected.assign(run=str(path)),
-        "assignments": _newest(table("assignments.csv", "no head shares")),
-        "errors": _newest(table("prediction_error.csv", "no prediction errors")),
-    }
+    return run
 
 
-def _read_table(path: Path) -> pd.DataFrame:
-    columns = _COLUMNS[path.name]
-    if not path.exists():
-        return pd.DataFrame({name: pd.Series(dtype=kind) for name, kind in columns.items()})
+def _read_table(path: Path, kinds: Any) -> pd.DataFrame:
     missing = {name: ["nan"] for name in ("share", "error")}
-    kinds: Any = columns
-    table = pd.read_csv(path, dtype=kinds, keep_default_na=False, na_values=missing)[list(columns)]
+    table = pd.read_csv(path, dtype=kinds, keep_default_na=False, na_values=missing)[list(kinds)]
     if "return" in table and not np.isfinite(table["return"]).all():
         raise ValueError(f"{path.name} holds a return that is no finite number")
     for text in table.get("sim_params", pd.Series(dtype=str)).unique():
@@ -219,12 +187,11 @@ def _read_table(path: Path) -> pd.DataFrame:
     return table
 
 
-def _read_metrics(path: Path) -> tuple[list[dict[str, Any]], pd.DataFrame, pd.DataFrame]:
-    """Lines of `metrics.jsonl`, with their rows of `Runs.curves` and `Runs.collected`."""
-    lines = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+def _summaries(metrics: str) -> dict[str, Any]:
+    """Number of iterations, minutes by phase, curves and collected returns of `metrics.jsonl`."""
+    lines = [json.loads(line) for line in metrics.splitlines()]
     curves, collected = [], []
     for line in lines:
-        line.setdefault("seconds", {})
         when, summaries = int(line["iteration"]), dict(line.get("evaluation", {}))
         if line.get("collection"):
             summaries[COLLECTED] = line["collection"]
@@ -233,15 +200,14 @@ def _read_metrics(path: Path) -> tuple[list[dict[str, Any]], pd.DataFrame, pd.Da
         for group, summary in summaries.items():
             numbers = (float(summary["return_mean"]), float(summary["return_std"]))
             curves.append((when, int(line["timesteps"]), group, *numbers))
-    return (
-        lines,
-        pd.DataFrame(curves, columns=["iteration", "timesteps", "group", "return", "std"]),
-        pd.DataFrame(collected, columns=["iteration", "group", "episode", "return"]),
-    )
-
-
-def _newest(table: pd.DataFrame) -> pd.DataFrame:
-    return table[table.iteration == table.iteration.max()]
+    seconds = [line.get("seconds", {}) for line in lines]
+    columns = ["iteration", "timesteps", "group", "return", "std"]
+    return {
+        "iterations": len(lines),
+        **{phase: sum(s.get(phase, 0.0) for s in seconds) / 60 for phase in PHASES},
+        "curves": pd.DataFrame(curves, columns=columns),
+        "collected": pd.DataFrame(collected, columns=["iteration", "group", "episode", "return"]),
+    }
 
 
 def _flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -274,17 +240,18 @@ def _labels(runs: pd.DataFrame, settings: Mapping[str, Mapping[str, Any]]) -> li
             names[str(method)]["preset"] = None
         for tables in presets:
             names[str(method)] |= dict.fromkeys(differing(tables))
-    labels: list[str] = []
-    numbers: dict[str, dict[str, int]] = {}
+    labels = []
     for method, run in zip(runs.method, runs["run"], strict=True):
         variant = [
             f"{name.rpartition('.')[2].replace('_', ' ')} {value_text(settings[run].get(name))}"
             for name in names[method]
         ]
-        label = ", ".join([method, *variant])
-        number = numbers.setdefault(method, {}).setdefault(label, len(numbers[method]) + 1)
-        labels.append(label if len(label) <= _LONG_LABEL else f"{method}, variant {number}")
-    return labels
+        labels.append(", ".join([method, *variant]))
+    numbers = {label: number for number, label in enumerate(dict.fromkeys(labels), start=1)}
+    return [
+        label if len(label) <= _LONG_LABEL else f"{method}, variant {numbers[label]}"
+        for method, label in zip(runs.method, labels, strict=True)
+    ]
 
 
 def differing(tables: Sequence[Mapping[str, Any]], unless: Sequence[str] = _NO_VARIANT) -> list:
@@ -312,8 +279,9 @@ def _scores(found: Runs) -> list[float]:
     """
     variants = found.runs.groupby(["env", "method"])["label"].nunique()
     single = {key for key in variants[variants == 1].index if key[1] in REFERENCES}
-    found.runs["is_reference"] = [key in single for key in found.runs[["env", "method"]].itertuples(
-        index=False, name=None)]  # fmt: skip
+    found.runs["is_reference"] = [
+        key in single for key in zip(found.runs.env, found.runs.method, strict=True)
+    ]
     if found.runs.is_reference.all():
         found.runs["is_reference"] = False
     place = ["method", "env", "protocol", "sim_params"]
@@ -366,77 +334,62 @@ def by_group(episodes: pd.DataFrame) -> pd.DataFrame:
     return table.drop(columns="square")
 
 
-def episode_table(rows: Sequence[EpisodeRow], config: Config) -> pd.DataFrame:
-    """Test episodes of one run as a table with scores, for `by_physics` and `by_group`."""
-    table = pd.DataFrame([row.to_csv() for row in rows], columns=list(EpisodeRow.__annotations__))
-    table["return"] = [row.episode_return for row in rows]
-    table["score"] = np.array([score_of(row, config) for row in rows], float)
-    return table.assign(label=config.method, run="", protocol="")
+def evaluation(
+    rows: Sequence[EpisodeRow], config: Config, title: str = ""
+) -> tuple[dict[str, Any], Table]:
+    """Summarise test episodes of one run by group and by physics.
 
-
-def facts(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """Lines of `by_physics` or `by_group` as plain values, for JSON."""
+    Returns:
+        Returns and scores as plain values for JSON, and laid out for a terminal.
+    """
+    episodes = pd.DataFrame([row.to_csv() for row in rows]).assign(
+        score=np.array([score_of(row, config) for row in rows], float),
+        label=config.method,
+        run="",
+        protocol="",
+    )
     names = ["group", "sim_params", "episodes", "return_mean", "return_std", "score"]
-    shown = table[[name for name in names if name in table]]
-    lines: list[dict[str, Any]] = shown.to_dict("records")  # type: ignore[assignment]
-    for line in lines:
+    facts: dict[str, list[dict[Any, Any]]] = {
+        name: summary.filter(names).to_dict("records")
+        for name, summary in (("groups", by_group(episodes)), ("physics", by_physics(episodes)))
+    }
+    for line in itertools.chain(*facts.values()):
         line["score"] = None if np.isnan(line["score"]) else line["score"]
         if "sim_params" in line:
             line["sim_params"] = parse_sim_params(line["sim_params"])
-    return lines
-
-
-def evaluation_facts(rows: Sequence[EpisodeRow], config: Config) -> dict[str, Any]:
-    """Returns and scores of test episodes by group and by physics, for JSON."""
-    episodes = episode_table(rows, config)
-    return {"groups": facts(by_group(episodes)), "physics": facts(by_physics(episodes))}
-
-
-def evaluation(rows: Sequence[EpisodeRow], config: Config, title: str) -> Table:
-    """Lay out the returns of test episodes for a terminal: by group, then by physics."""
-    episodes = episode_table(rows, config)
-    physics, groups = facts(by_physics(episodes)), facts(by_group(episodes))
-    scored = any(line["score"] is not None for line in physics)
+    scored = any(line["score"] is not None for line in facts["physics"])
     table = new_table(title, "physics", numbers=["episodes", "return", *["score"] * scored])
-    names = varying([line["sim_params"] for line in physics])
-
-    def cells(line: Mapping[str, Any]) -> list[str]:
-        spread = f" ± {line['return_std']:,.1f}" if line["episodes"] > 1 else ""
-        score = "–" if line["score"] is None else f"{line['score']:.2f}"
-        return [str(line["episodes"]), f"{line['return_mean']:,.1f}{spread}", *[score] * scored]
-
-    for group in groups:
-        table.add_row(group_label(group["group"]), *cells(group), style="bold")
-        for line in physics:
-            if line["group"] == group["group"]:
-                table.add_row(f"  {full_label(line['sim_params'], names)}", *cells(line))
+    names = varying([line["sim_params"] for line in facts["physics"]])
+    for group in facts["groups"]:
+        parts = [line for line in facts["physics"] if line["group"] == group["group"]]
+        for line in (group, *parts):
+            name = group_label(line["group"])
+            if line is not group:
+                name = f"  {full_label(line['sim_params'], names)}"
+            spread = f" ± {line['return_std']:,.1f}" if line["episodes"] > 1 else ""
+            score = "–" if line["score"] is None else f"{line['score']:.2f}"
+            cells = [str(line["episodes"]), f"{line['return_mean']:,.1f}{spread}"]
+            style = "bold" if line is group else None
+            table.add_row(name, *cells, *[score] * scored, style=style)
         table.add_section()
     table.caption = (
         "return: mean ± standard deviation over episodes; every physics of a group counts once"
         + "; score: 0 = random actions, 1 = the paper's planner on the true dynamics" * scored
     )
-    return table
+    return facts, table
 
 
-class TextTable(Table):
-    """A table whose texts are shown as they are: what is in brackets is no markup."""
-
-    def add_row(self, *cells: Any, **look: Any) -> None:
-        """Add a line of cells; strings are plain text."""
-        plain = [Text(cell) if isinstance(cell, str) else cell for cell in cells]
-        super().add_row(*plain, **look)
-
-
-def new_table(title: str, *texts: str, numbers: Sequence[str] = ()) -> TextTable:
+def new_table(title: str, *texts: str, numbers: Sequence[str] = ()) -> Table:
     """An empty table in the look of all others: columns of texts, then columns of numbers."""
-    table = TextTable(
+    table = Table(
         *texts,
-        title=Text(title, "bold"),
+        title=title,
+        title_style="bold",
         title_justify="left",
+        caption_style="dim",
         caption_justify="left",
         box=box.SIMPLE_HEAD,
     )
-    table.caption_style = "dim"
     for name in numbers:
         table.add_column(name, justify="right")
     return table

@@ -77,9 +77,9 @@ class SelectionSummary:
     """Error of the best head of each episode and member, in hindsight."""
     average_error: float
     """Error of a head chosen blindly."""
-    wrong: float
+    wrong_selections: float
     """Share of selections that are not the best head in hindsight."""
-    settling: float | None
+    settling_steps: float | None
     """Median number of transitions seen before selection settles; None if it never does."""
     settled: float
     """Share of episodes and members in which it settles."""
