@@ -11,7 +11,7 @@ import pytest
 from workloads import make_agent, planners
 
 from headway.config import MultiHeadedConfig
-from headway.planning.flop import plan_flop
+from headway.planning.rollouts import plan_flop
 
 FIRST_PLAN = Path(__file__).parent / "first_plan.py"
 

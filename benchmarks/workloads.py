@@ -7,10 +7,10 @@ import numpy as np
 
 from headway.config import FittingConfig, MultiHeadedConfig, PlannerConfig
 from headway.data import Episodes, Samples, Trajectory
-from headway.models.acting import MultiHeadModel
 from headway.models.fitting import FitData, FitSetup, FitState, make_data
 from headway.models.last_layer import Prior
-from headway.models.multi_headed import MultiHeadDynamics, Statistics
+from headway.models.multi_headed import MultiHeadModel, MultiHeadNet
+from headway.models.statistics import Statistics
 from headway.planning.agent import Agent, AgentState
 from headway.task import Task, env_spec
 
@@ -26,7 +26,7 @@ def make_agent(
     """An untrained agent, its first state, and what it sees; the paper's settings by default."""
     model, planner = model or MultiHeadedConfig(), planner or PlannerConfig()
     task = env_spec("half-cheetah").make_task()
-    dynamics = MultiHeadDynamics.init(model, task, key=jax.random.key(0))
+    dynamics = MultiHeadNet.init(model, task, key=jax.random.key(0))
     statistics = Statistics.identity(task, model.history_length)
     acting = MultiHeadModel(dynamics, statistics, task, planner, model.history_length, prior)
     agent = Agent(acting, task, planner)
@@ -66,7 +66,7 @@ def make_fit(
         fitting: Settings of the fit.
     """
     task = env_spec("half-cheetah").make_task()
-    dynamics = MultiHeadDynamics.init(model, task, key=jax.random.key(0))
+    dynamics = MultiHeadNet.init(model, task, key=jax.random.key(0))
     trajectories = make_trajectories(task, num_episodes, EPISODE_LENGTH)
     setup = FitSetup(task, fitting, model.history_length)
     samples = Samples.table(
@@ -85,7 +85,7 @@ def make_fit(
     return FitState.new(dynamics), setup, data
 
 
-def update_flop(model: MultiHeadDynamics, batch_size: int) -> float:
+def update_flop(model: MultiHeadNet, batch_size: int) -> float:
     """Operations of the matrix products of one update: forwards, and twice that backwards."""
     weights: list[Any] = [leaf for leaf in jax.tree.leaves(model) if leaf.ndim >= 3]
     return 6.0 * batch_size * sum(weight.size for weight in weights)

@@ -1,18 +1,19 @@
 """Tiny tasks, data and exactly known models that the tests of the core share."""
 
+import functools
 from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from headway.config import MultiHeadedConfig
-from headway.data import Episodes, Samples, Trajectory
-from headway.models.acting import MultiHeadModel
-from headway.models.multi_headed import MultiHeadDynamics, Statistics
-from headway.models.networks import Dense, DenseHeads, GaussianNet
+from headway.config import CEMConfig, FittingConfig, MultiHeadedConfig, PlannerConfig
+from headway.data import Episodes, Samples, Trajectory, where_env
+from headway.models.fitting import FitSetup, make_data
+from headway.models.multi_headed import MultiHeadModel, MultiHeadNet
+from headway.models.networks import Dense, GaussianNet
+from headway.models.statistics import Statistics
 from headway.planning.agent import Agent
-from headway.planning.optimizers import where_env
 from headway.task import Task
 
 
@@ -55,6 +56,14 @@ SMALL = MultiHeadedConfig(
     context_hidden_sizes=(6,),
     history_length=3,
 )
+TINY = PlannerConfig(
+    horizon=4,
+    num_candidates=60,
+    optimizer=CEMConfig(num_elites=10),
+    num_iterations=4,
+    num_particles=2,
+    selection_length=2,
+)
 POINT = PointTask()
 
 
@@ -77,12 +86,26 @@ def lay_out(trajectories, *, max_length=None, capacity=None, future_length=2, sa
     return episodes, Samples.table(lengths, future_length, sample_capacity or count + 3)
 
 
+def make_setup(history_length=3, **settings):
+    return FitSetup(POINT, FittingConfig(**settings), history_length)
+
+
+def fit_data(trajectories, setup, *, members=2, statistics=None, **layout):
+    """All that an epoch reads; normalisers are fitted by default."""
+    layout = {"future_length": setup.config.future_length} | layout
+    episodes, samples = lay_out(trajectories, **layout)
+    if statistics is None:
+        statistics = Statistics.fit(POINT, trajectories, setup.history_length)
+    key = jax.random.key(9)
+    return make_data(episodes, samples, statistics, setup.config, num_members=members, key=key)
+
+
 def small_model(seed=0, task=POINT, config=SMALL):
     """A random model whose biases and variance bounds are not at their initial values either."""
     rng = np.random.default_rng(seed)
     names = ("gain", "drag") if config.context == "sim-params" else ()
     shapes = jax.eval_shape(
-        lambda key: MultiHeadDynamics.init(config, task, sim_param_names=names, key=key),
+        lambda key: MultiHeadNet.init(config, task, sim_param_names=names, key=key),
         jax.random.key(0),
     )
 
@@ -109,8 +132,25 @@ def linear_model(gains):
     full = np.concatenate([np.zeros((members, heads, obs_size, obs_size)), gains], axis=2)
     hidden = Dense(jnp.asarray(np.tile(twice, (members, 1, 1))), jnp.zeros((members, 2 * size)))
     weight = jnp.asarray(np.concatenate([full, -full], axis=2), jnp.float32)
-    mean_heads = DenseHeads(weight, jnp.zeros((members, heads, obs_size)))
-    return MultiHeadDynamics(GaussianNet((hidden,), mean_heads, None, None, None), None, None)
+    mean_heads = Dense(weight, jnp.zeros((members, heads, obs_size)))
+    return MultiHeadNet(GaussianNet((hidden,), mean_heads, None, None, None), None, None)
+
+
+def with_noise(net, stds):
+    """A deterministic network of one member whose heads have noise of known deviations."""
+    logvar = 2 * jnp.log(jnp.asarray(stds))[None, :, None]
+    bias = jnp.broadcast_to(logvar, net.mean_heads.bias.shape)
+    shape = net.mean_heads.bias.shape[1:]
+    heads = Dense(jnp.zeros(net.mean_heads.weight.shape), bias)
+    return GaussianNet(
+        net.hidden, net.mean_heads, heads, jnp.full(shape, 20.0), jnp.full(shape, -60.0)
+    )
+
+
+def predict(net, x, context=None):
+    """A network's prediction, samples before features."""
+    columns = net(x.mT, None if context is None else context.mT)
+    return jax.tree.map(lambda values: values.mT, columns)
 
 
 def make_agent(net, planner, *, statistics=None, task=POINT, history_length=3, prior=None):
@@ -143,6 +183,23 @@ def odd_statistics(task=POINT, history_length=3, seed=5, sim_param_names=()):
 
 def softplus(x):
     return np.logaddexp(0.0, x)
+
+
+def sigmoid(x):
+    return 1 / (1 + np.exp(-x))
+
+
+def assert_equal(first, second):
+    jax.tree.map(np.testing.assert_array_equal, first, second)
+
+
+def assert_close(first, second, rtol=1e-4, atol=1e-6):
+    close = functools.partial(np.testing.assert_allclose, rtol=rtol, atol=atol)
+    jax.tree.map(close, first, second)
+
+
+def assert_finite(tree):
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
 
 
 def f64(tree):

@@ -23,7 +23,7 @@ from .lab.record import record as record
 from .lab.report import write_report as write_report
 from .models.base import FunctionModel as FunctionModel
 from .models.fitting import EpochStats as EpochStats
-from .models.multi_headed import MultiHeadDynamics as MultiHeadDynamics
+from .models.multi_headed import MultiHeadNet as MultiHeadNet
 from .planning.agent import Agent as Agent
 from .planning.controller import Controller as Controller
 from .planning.optimizers import CEM as CEM

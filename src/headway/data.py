@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from headway.errors import BadEnvironmentError, ConfigError
+
+Tree = TypeVar("Tree")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,10 +41,10 @@ class Trajectory:
                 f" {len(self.reward)} rewards, allowed: T + 1, T and T with T at least 1."
             )
         for name in ("obs", "action", "reward"):
-            if not np.isfinite(getattr(self, name)).all():
-                step = int(np.argwhere(~np.isfinite(getattr(self, name)))[0][0])
+            bad = np.argwhere(~np.isfinite(getattr(self, name)))
+            if len(bad):
                 raise BadEnvironmentError(
-                    f"{name} at step {step} is not finite, allowed: finite numbers; check the"
+                    f"{name} at step {bad[0][0]} is not finite, allowed: finite numbers; check the"
                     f" environment under sim_params {dict(self.sim_params)}."
                 )
 
@@ -192,17 +194,19 @@ class Samples(NamedTuple):
             capacity: Rows of the table, at least as many as there are valid samples.
             drop_first: Leave out anchor 0 of each episode, as the released code does.
         """
-        rows = [np.zeros((0, 3), np.int32)]
-        for episode, length in enumerate(lengths):
-            anchor, offset = np.meshgrid(np.arange(length), np.arange(future_length), indexing="ij")
-            valid = (anchor + offset < length) & (anchor >= int(drop_first))
-            triple = np.stack([np.full_like(anchor, episode), anchor, offset], axis=-1)
-            rows.append(triple[valid].astype(np.int32))
-        table = np.concatenate(rows)
-        padded = np.zeros((capacity, 3), np.int32)
-        padded[: len(table)] = table
-        columns = [jnp.asarray(padded[:, i]) for i in range(3)]
-        return cls(*columns, count=jnp.asarray(len(table), jnp.int32))
+        length = np.asarray(lengths)[:, None, None]
+        anchor, offset = np.arange(length.max())[:, None], np.arange(future_length)
+        valid = np.argwhere((anchor + offset < length) & (anchor >= int(drop_first)))
+        table = np.zeros((3, capacity), np.int32)
+        table[:, : len(valid)] = valid.T
+        return cls(*map(jnp.asarray, table), count=jnp.asarray(len(valid), jnp.int32))
+
+
+def where_env(condition: Bool[Array, " env"], chosen: Tree, other: Tree) -> Tree:
+    """For each environment, the arrays of one tree or those of the other; environments lead."""
+    return jax.tree.map(
+        lambda x, y: jnp.where(condition.reshape(-1, *[1] * (x.ndim - 1)), x, y), chosen, other
+    )
 
 
 def segment_sums(

@@ -26,8 +26,9 @@ from headway.models.losses import (
     total_loss,
     weight_decay_loss,
 )
-from headway.models.multi_headed import MultiHeadDynamics, Statistics
-from headway.models.networks import ContextEncoder, Dense, DenseHeads, GaussianNet, Normalizer
+from headway.models.multi_headed import MultiHeadNet
+from headway.models.networks import ContextEncoder, Dense, GaussianNet
+from headway.models.statistics import Normalizer, Statistics
 from headway.worlds.locomotion import HalfCheetahTask
 
 SEGMENT = 10
@@ -47,7 +48,7 @@ def dense(path):
 
 def dense_heads(path, kind):
     heads = [dense(f"{path}/head{i}/{kind}") for i in range(NUM_HEADS)]
-    return DenseHeads(
+    return Dense(
         jnp.stack([head.weight for head in heads], 1), jnp.stack([head.bias for head in heads], 1)
     )
 
@@ -67,9 +68,7 @@ def dynamics(path):
     encoder = ContextEncoder(
         tuple(dense(f"{path}/context/hidden{i}") for i in range(3)), dense(f"{path}/context/output")
     )
-    return MultiHeadDynamics(
-        gaussian_net(f"{path}/forward"), gaussian_net(f"{path}/backward"), encoder
-    )
+    return MultiHeadNet(gaussian_net(f"{path}/forward"), gaussian_net(f"{path}/backward"), encoder)
 
 
 def normalizer(name, *shape):
@@ -130,9 +129,7 @@ def compute(model, statistics, batch):
         GaussianNet(net.hidden, net.mean_heads, None, None, None)
         for net in (model.forward_net, model.backward_net)
     ]
-    squared = head_losses(
-        MultiHeadDynamics(*silent, model.context_encoder), TASK, statistics, batch
-    )
+    squared = head_losses(MultiHeadNet(*silent, model.context_encoder), TASK, statistics, batch)
     scalars = {
         "loss_independent_forward": independent_loss(losses.forward, weight),
         "loss_independent_backward": independent_loss(losses.backward, weight),

@@ -1,12 +1,10 @@
 """Set-ups of the tests of GrBAL's and ReBAL's networks."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 import toys
-from headway.config import FittingConfig, GradientAdaptedConfig
-from headway.models.fitting import make_data
+from headway.config import GradientAdaptedConfig
 from headway.models.grbal import Window
 
 TINY = GradientAdaptedConfig(hidden_sizes=(5,))
@@ -22,8 +20,5 @@ def random_window(seed, *shape):
 
 def toy_data(gains, steps=40):
     trajectories = [toys.random_trajectory(steps, i, gain) for i, gain in enumerate(gains)]
-    episodes, samples = toys.lay_out(trajectories, future_length=1, max_length=steps + 3)
-    statistics = toys.identity_statistics()
-    return make_data(
-        episodes, samples, statistics, FittingConfig(), num_members=1, key=jax.random.key(0)
-    ), trajectories
+    layout = {"future_length": 1, "max_length": steps + 3, "statistics": toys.identity_statistics()}
+    return toys.fit_data(trajectories, toys.make_setup(), members=1, **layout), trajectories

@@ -7,9 +7,11 @@ import sys
 import jax
 import pytest
 
+from headway.cli import main
 from headway.models import compilation
+from headway.models.compilation import prepare_jax
 
-SETTINGS = """
+IMPORTS = """
 import jax, pkgutil, importlib
 before = dict(jax.config.values)
 import headway
@@ -22,70 +24,81 @@ PROGRAM = """
 import jax, jax.numpy as jnp
 from headway.models.compilation import jit_networks, prepare_jax
 prepare_jax()
-prepare_jax()
-print(jax.config.jax_persistent_cache_min_compile_time_secs)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", {seconds})
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 print(jit_networks(lambda x: jnp.tanh(x) @ x)(jnp.eye(3)).sum())
 """
-KEPT = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
+FOLDER, SECONDS = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
 
 
 def run(program, **variables):
     env = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XDG_CACHE"))}
     asked = [sys.executable, "-c", program]
-    return subprocess.run(asked, check=False, env=env | variables, capture_output=True, text=True)
+    done = subprocess.run(asked, check=False, env=env | variables, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
 
 
-def kept(cache_home, **variables):
-    """Names of what a program leaves in the user's cache folder."""
-    found = run(PROGRAM.format(seconds=0.0), XDG_CACHE_HOME=str(cache_home), **variables)
-    assert found.returncode == 0, found.stderr
-    return sorted(path.name for path in cache_home.rglob("*-cache"))
+@pytest.fixture
+def jax_settings():
+    """JAX's settings, to be changed until the test ends."""
+    names = (FOLDER, SECONDS, "jax_enable_compilation_cache", "jax_enable_x64")
+    before = {name: getattr(jax.config, name) for name in names}
+    yield jax.config
+    for name, value in before.items():
+        jax.config.update(name, value)
 
 
 def test_importing_changes_no_setting_of_jax():
-    found = run(SETTINGS)
-    assert found.stdout.strip() == "[]", found.stderr
+    assert run(IMPORTS) == "[]"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="XDG folders")
 def test_compiled_functions_are_kept_in_the_users_cache_folder(tmp_path):
-    first = kept(tmp_path)
-    assert any("lambda" in name for name in first)
-    assert kept(tmp_path) == first
-    elsewhere = tmp_path / "mine"
-    kept(tmp_path / "unused", JAX_COMPILATION_CACHE_DIR=str(elsewhere))
-    assert not (tmp_path / "unused").exists()
-    assert list(elsewhere.glob("*-cache"))
-    assert not kept(tmp_path / "off", JAX_ENABLE_COMPILATION_CACHE="0")
+    kept = []
+    for _ in range(2):
+        run(PROGRAM, XDG_CACHE_HOME=str(tmp_path))
+        kept.append(sorted(path.name for path in tmp_path.rglob("*-cache")))
+    assert any("lambda" in name for name in kept[0])
+    assert kept[1] == kept[0]
 
 
-@pytest.mark.parametrize(("chosen", "seconds"), [(None, 0.05), ("1.0", 1.0), ("0.3", 0.3)])
-def test_short_compilations_are_kept_too_unless_the_user_says_otherwise(chosen, seconds, tmp_path):
-    variables = {} if chosen is None else {KEPT: chosen}
-    found = run(PROGRAM.format(seconds=1.0), XDG_CACHE_HOME=str(tmp_path), **variables)
-    assert float(found.stdout.split()[0]) == seconds
+@pytest.mark.parametrize(("chosen", "seconds"), [(None, 0.05), ("1.0", 1.0)])
+def test_a_cache_is_kept_as_the_user_says(chosen, seconds, tmp_path, jax_settings, monkeypatch):
+    if chosen:
+        monkeypatch.setenv(SECONDS.upper(), chosen)
+    jax_settings.update(SECONDS, 1.0)
+    jax_settings.update(FOLDER, str(tmp_path / "mine"))
+    prepare_jax()
+    prepare_jax()
+    assert getattr(jax_settings, SECONDS) == seconds
+    assert getattr(jax_settings, FOLDER) == str(tmp_path / "mine")
 
 
-def test_a_cache_that_cannot_be_written_is_one_warning(tmp_path):
+def test_no_cache_is_made_where_it_is_turned_off(jax_settings):
+    jax_settings.update("jax_enable_compilation_cache", False)
+    jax_settings.update(FOLDER, None)
+    prepare_jax()
+    assert getattr(jax_settings, FOLDER) is None
+
+
+def test_a_cache_that_cannot_be_written_is_one_warning(tmp_path, jax_settings, recwarn):
     (tmp_path / "file").touch()
-    folder = str(tmp_path / "file" / "cache")  # root may write in any folder
-    found = run(PROGRAM.format(seconds="jnp.inf"), JAX_COMPILATION_CACHE_DIR=folder)
-    assert found.returncode == 0, found.stderr
-    assert found.stderr.count("Warning") == 1
-    assert f"cannot be kept in {folder}" in found.stderr
+    jax_settings.update(FOLDER, str(tmp_path / "file" / "cache"))  # root may write in any folder
+    prepare_jax()
+    prepare_jax()
+    (warning,) = recwarn
+    assert f"cannot be kept in {tmp_path}/file/cache" in str(warning.message)
 
 
-def test_64_bit_mode_is_refused_in_one_line_before_anything_is_collected(tmp_path):
-    program = "import sys; from headway.cli import main; sys.exit(main(sys.argv[1:]))"
-    asked = [sys.executable, "-c", program, "train", "pendulum", "--preset", "smoke", "--quiet"]
-    env = {**os.environ, "JAX_ENABLE_X64": "1"}
-    found = subprocess.run(
-        asked, check=False, env=env, cwd=tmp_path, capture_output=True, text=True
-    )
-    assert found.returncode == 1
-    assert found.stderr.startswith("error: JAX is in 64-bit mode, allowed: 32-bit mode")
-    assert found.stderr.count("\n") == 1
+def test_64_bit_mode_is_refused_in_one_line_before_anything_is_collected(
+    tmp_path, jax_settings, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    jax_settings.update("jax_enable_x64", True)
+    assert main(["train", "pendulum", "--preset", "smoke", "--quiet"]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("error: JAX is in 64-bit mode, allowed: 32-bit mode")
+    assert said.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 

@@ -6,8 +6,8 @@ import numpy as np
 from adaptive_helpers import random_window, toy_data
 
 import toys
-from headway.config import FittingConfig, RecurrentConfig
-from headway.models.fitting import FitSetup, FitState
+from headway.config import RecurrentConfig
+from headway.models.fitting import FitState
 from headway.models.grbal import Window
 from headway.models.rebal import (
     RecurrentNet,
@@ -25,10 +25,6 @@ def tiny_net(seed=0, sizes=(3, 4)):
     return jax.tree.map(lambda x: x + 0.1 * jnp.asarray(rng.normal(size=x.shape), x.dtype), net)
 
 
-def sigmoid(x):
-    return 1 / (1 + np.exp(-x))
-
-
 def twin_rollout(net, xs):
     """Predictions of one sequence, one unit at a time, in NumPy's float64."""
     net = toys.f64(net)
@@ -42,8 +38,10 @@ def twin_rollout(net, xs):
             gates = joined @ layer.weight[0] + layer.bias[0]
             for unit in range(size):
                 let_in, keep, new, let_out = gates[unit::size]
-                cell[i][unit] = sigmoid(keep) * cell[i][unit] + sigmoid(let_in) * np.tanh(new)
-                hidden[i][unit] = sigmoid(let_out) * np.tanh(cell[i][unit])
+                cell[i][unit] = toys.sigmoid(keep) * cell[i][unit] + toys.sigmoid(let_in) * np.tanh(
+                    new
+                )
+                hidden[i][unit] = toys.sigmoid(let_out) * np.tanh(cell[i][unit])
             x = hidden[i]
         found.append(x @ net.output.weight[0] + net.output.bias[0])
     return np.array(found)
@@ -64,14 +62,7 @@ def whole_loss(net, batch):
 def rollout(net, xs, state=None):
     """Predictions of whole sequences [episode, step, in]; the state from zero by default."""
     state = net.start(len(xs)) if state is None else state
-    return go_through(net, state, xs)[1].swapaxes(0, 1)
-
-
-def go_through(net, state, xs):
-    def step(state, x):
-        return net(state, x)
-
-    return jax.lax.scan(step, state, xs.swapaxes(0, 1))
+    return jax.lax.scan(net, state, xs.swapaxes(0, 1))[1].swapaxes(0, 1)
 
 
 def test_an_untruncated_gradient_is_that_of_the_whole_error_whatever_the_padding():
@@ -79,8 +70,7 @@ def test_an_untruncated_gradient_is_that_of_the_whole_error_whatever_the_padding
     loss, grads = truncated(net, batch, 7)
     expected, expected_grads = jax.jit(jax.value_and_grad(whole_loss))(net, batch)
     np.testing.assert_allclose(loss, expected, rtol=1e-5)
-    for found, wanted in zip(jax.tree.leaves(grads), jax.tree.leaves(expected_grads), strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-6)
+    toys.assert_close(grads, expected_grads)
     np.testing.assert_allclose(truncated(net, batch, 9)[0], expected, rtol=1e-5)
 
 
@@ -91,7 +81,7 @@ def test_a_truncated_gradient_stops_between_chunks_but_the_state_goes_on():
 
     def second_half(net):
         """The error of the second chunk alone, from the state that the first one ends with."""
-        state, _ = go_through(net, net.start(2), batch.x[:, :4])
+        state, _ = jax.lax.scan(net, net.start(2), batch.x[:, :4].swapaxes(0, 1))
         predicted = rollout(net, batch.x[:, 4:], jax.lax.stop_gradient(state))
         errors = jnp.square(predicted - batch.delta[:, 4:]).mean(-1)
         return (batch.weight[:, 4:] * errors).sum() / batch.weight.sum()
@@ -100,8 +90,7 @@ def test_a_truncated_gradient_stops_between_chunks_but_the_state_goes_on():
     share = first.weight.sum() / batch.weight.sum()
     halves = jax.jit(jax.grad(second_half))(net), truncated(net, first, 4)[1]
     expected = jax.tree.map(lambda a, b: a + share * b, *halves)
-    for found, wanted in zip(jax.tree.leaves(grads), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-6)
+    toys.assert_close(grads, expected)
 
 
 def test_an_epoch_shows_every_episode_once_in_batches_of_whole_ones():
@@ -109,7 +98,7 @@ def test_an_epoch_shows_every_episode_once_in_batches_of_whole_ones():
     state = FitState.new(tiny_net())
     updates = []
     for batch_size in (1, 26, 1000):
-        setup = FitSetup(toys.POINT, FittingConfig(batch_size=batch_size, backprop_steps=5), 1)
+        setup = toys.make_setup(1, batch_size=batch_size, backprop_steps=5)
         stats = recurrent_epoch(state, setup, data, key=jax.random.key(0))[1]
         updates.append(int(stats.updates))
     assert updates == [3, 2, 1]
@@ -122,9 +111,7 @@ def test_an_epoch_shows_every_episode_once_in_batches_of_whole_ones():
 
 def test_memory_tells_physics_apart():
     data, trajectories = toy_data([0.5, 1.0, 1.5, 2.0], steps=24)
-    setup = FitSetup(
-        toys.POINT, FittingConfig(batch_size=54, backprop_steps=12, learning_rate=1e-2), 1
-    )
+    setup = toys.make_setup(1, batch_size=54, backprop_steps=12, learning_rate=1e-2)
     config = RecurrentConfig(hidden_sizes=(24,))
     net = RecurrentNet.init(config, toys.POINT, key=jax.random.key(0))
     state = FitState.new(net)

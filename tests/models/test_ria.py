@@ -11,9 +11,9 @@ import pytest
 import toys
 from headway.config import FittingConfig
 from headway.data import History
-from headway.models.fitting import FitSetup, FitState, fit_epoch, gather_batch, make_data, update
+from headway.models.fitting import FitState, fit_epoch, gather_batch, update
 from headway.models.losses import HIDDEN_DECAY, Batch
-from headway.models.multi_headed import MultiHeadDynamics, Statistics, network_input
+from headway.models.multi_headed import MultiHeadNet
 from headway.models.ria import (
     intervene,
     intervention_distance,
@@ -21,6 +21,7 @@ from headway.models.ria import (
     relation_gradient,
     relation_parts,
 )
+from headway.models.statistics import network_input
 
 RIA = dataclasses.replace(toys.SMALL, num_heads=1, context_at="last-hidden", relation_head=True)
 CONFIG = FittingConfig(relation_temperature=0.7, backward_weight=0.3, relation_distance_weight=1.5)
@@ -49,14 +50,10 @@ def distances_twin(model, batch, states):
         means = np.zeros((2, len(states), SAMPLES, 2))
         for row, state in enumerate(states):
             same_state = jnp.repeat(x[:, state : state + 1], SAMPLES, axis=1)
-            means[:, row] = net(same_state, context).mean[:, 0]
+            means[:, row] = toys.predict(net, same_state, context).mean[:, 0]
         for m, i, j in np.ndindex(2, SAMPLES, SAMPLES):
             found[direction, m, i, j] = np.abs(means[m, :, i] - means[m, :, j]).mean()
     return found
-
-
-def sigmoid(x):
-    return 1 / (1 + np.exp(-x))
 
 
 def losses_twin(model, batch, states):
@@ -76,7 +73,7 @@ def losses_twin(model, batch, states):
             y, w = float(rows[m, i] == rows[m, j]), similar[m, i, j]
             pull += (forward[m, i, j] + 0.3 * backward[m, i, j]) * y / len(pairs)
             score = np.concatenate([context[m, i], context[m, j]]) @ head.weight[m, :, 0]
-            p = sigmoid(score + head.bias[m, 0])
+            p = toys.sigmoid(score + head.bias[m, 0])
             loss = -(y + w * (1 - y)) * np.log(p) - (1 - y) * (1 - w) * np.log(1 - p)
             relation += loss / len(pairs)
     return 1.5 * pull, similar, relation
@@ -105,22 +102,6 @@ def test_contexts_are_compared_right_wherever_they_join(place):
     np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_padding_changes_nothing():
-    model, batch = toys.small_model(config=RIA), random_batch()
-    spoiled = batch._replace(
-        obs=batch.obs.at[:, 4].add(9.0),
-        history=jax.tree.map(lambda x: x.at[:, 4].add(9.0), batch.history),
-        trajectory=batch.trajectory.at[:, 4].set(7),
-    )
-    found = []
-    for one in (batch, spoiled):
-        pull, similar = intervene(model, toys.POINT, STATISTICS, one, CONFIG)
-        loss, _ = relation_gradient(model, STATISTICS, one, similar, 0.0)
-        found.append((pull, similar[:, :4, :4], loss))
-    for a, b in zip(*found, strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-4)
-
-
 def test_weight_decay_averages_the_encoders_layers():
     model = toys.small_model(config=RIA)
     encoder, head = model.context_encoder, model.relation_head
@@ -131,19 +112,11 @@ def test_weight_decay_averages_the_encoders_layers():
     np.testing.assert_allclose(got, mean + of_head, rtol=1e-5)
 
 
-def fit_data(setup, trajectories):
-    episodes, samples = toys.lay_out(trajectories)
-    statistics = Statistics.fit(toys.POINT, trajectories, setup.history_length)
-    return make_data(
-        episodes, samples, statistics, setup.config, num_members=2, key=jax.random.key(9)
-    )
-
-
 def first_update():
     """A new model, and what its first update reads."""
-    setup = FitSetup(toys.POINT, FittingConfig(batch_size=8), 3)
-    data = fit_data(setup, [toys.random_trajectory(6, seed=n) for n in range(3)])
-    model = MultiHeadDynamics.init(RIA, toys.POINT, key=jax.random.key(0))
+    setup = toys.make_setup(batch_size=8)
+    data = toys.fit_data([toys.random_trajectory(6, seed=n) for n in range(3)], setup)
+    model = MultiHeadNet.init(RIA, toys.POINT, key=jax.random.key(0))
     order = jnp.broadcast_to(jnp.arange(8), (2, 8))
     batch, _ = gather_batch(data, None, order, jnp.ones((2, 8)), setup)
     return model, setup, data, batch
@@ -167,16 +140,14 @@ def test_nothing_is_learned_where_only_the_relation_loss_is_not_finite():
     state = FitState.new(eqx.tree_at(lambda model: model.relation_head.weight, model, huge))
     after, _, _, skipped = eqx.filter_jit(update)(state, setup, data.statistics, batch, None)
     assert bool(skipped)
-    for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(state), strict=True):
-        np.testing.assert_array_equal(a, b)
+    toys.assert_equal(after, state)
 
 
 def test_the_relation_is_learned_and_contexts_of_one_trajectory_come_together():
     trajectories = [toys.random_trajectory(12, seed=n, gain=g) for n, g in enumerate((1, -1) * 3)]
-    config = FittingConfig(batch_size=32, learning_rate=3e-3, relation_distance_weight=20.0)
-    setup = FitSetup(toys.POINT, config, 3)
-    data = fit_data(setup, trajectories)
-    state = FitState.new(MultiHeadDynamics.init(RIA, toys.POINT, key=jax.random.key(0)))
+    setup = toys.make_setup(batch_size=32, learning_rate=3e-3, relation_distance_weight=20.0)
+    data = toys.fit_data(trajectories, setup)
+    state = FitState.new(MultiHeadNet.init(RIA, toys.POINT, key=jax.random.key(0)))
     order = jnp.asarray(np.random.default_rng(0).integers(0, int(data.samples.count), (2, 32)))
     batch, _ = gather_batch(data, None, order, jnp.ones((2, 32)), setup)
 

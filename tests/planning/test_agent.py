@@ -1,34 +1,22 @@
 """The agent as a whole: what it remembers, which head it plans with, what it does."""
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 import toys
-from headway.config import CEMConfig, PlannerConfig
 from headway.models.base import FunctionModel
-from headway.models.multi_headed import Statistics
+from headway.models.statistics import Statistics
 from headway.planning.agent import Agent
 
-TINY = PlannerConfig(
-    horizon=4,
-    num_candidates=60,
-    optimizer=CEMConfig(num_elites=10),
-    num_iterations=4,
-    num_particles=2,
-    selection_length=2,
-)
 UP_DOWN = toys.linear_model([[np.eye(2), -np.eye(2)], [-np.eye(2), np.eye(2)]])
 OBS = jnp.asarray([[0.5, 0.5], [0.1, -0.4]])
 
 
 def make_agent(net=UP_DOWN, *, statistics=None, **settings):
-    return toys.make_agent(net, dataclasses.replace(TINY, **settings), statistics=statistics)
+    return toys.make_agent(net, dataclasses.replace(toys.TINY, **settings), statistics=statistics)
 
 
 def start(agent, num_envs=2, seed=0):
@@ -56,7 +44,7 @@ def test_actions_are_bounded_finite_and_of_the_tasks_shape():
         assert np.abs(np.asarray(decision.action)).max() <= 1.0
         np.testing.assert_array_equal(decision.failures, 0)
         np.testing.assert_array_equal(
-            decision.evaluations, TINY.num_candidates * TINY.num_iterations
+            decision.evaluations, toys.TINY.num_candidates * toys.TINY.num_iterations
         )
 
 
@@ -74,45 +62,18 @@ def test_a_change_of_physics_is_noticed_within_n_steps():
     assert decisions[3].heads.tolist() == [[1, 0], [1, 0]]
 
 
-@pytest.mark.parametrize("selection_length", [2, 5])
-def test_history_of_a_real_episode_equals_that_of_its_trajectory(selection_length):
-    agent = make_agent(selection_length=selection_length)
-    length = agent.model.history_length
-    state, rng = start(agent), np.random.default_rng(0)
-    obs, actions, histories = [rng.normal(size=(2, 2)).astype(np.float32)], [], []
-    for _ in range(8):
-        state, decision = agent.act(state, obs[-1])
-        histories.append(state.belief.recent.history(length))
-        actions.append(np.asarray(decision.action))
-        obs.append(rng.normal(size=(2, 2)).astype(np.float32))
-    trajectories = [
-        toys.Trajectory(*map(np.stack, (o, a)), np.zeros(8, np.float32), {})
-        for o, a in zip(np.stack(obs, 1), np.stack(actions, 1), strict=True)
-    ]
-    episodes, _ = toys.lay_out(trajectories)
-    for step, got in enumerate(histories):
-        want = episodes.history(jnp.arange(2), jnp.full(2, step), length)
-        np.testing.assert_array_equal(got.obs_diff, want.obs_diff)
-        np.testing.assert_array_equal(got.action, want.action)
-
-
 def test_same_state_same_action_and_the_key_moves_on():
-    agent = make_agent()
+    agent = make_agent(toys.small_model())
     state = start(agent)
     after, first = agent.act(state, OBS)
     _, again = agent.act(state, OBS)
     _, other = agent.act(start(agent, seed=1), OBS)
+    _, beside = agent.act(state, OBS.at[0].set(jnp.asarray([-0.9, 2.5])))
     np.testing.assert_array_equal(first.action, again.action)
     assert (first.action != other.action).any()
     assert (jax.random.key_data(after.key) != jax.random.key_data(state.key)).any()
-
-
-def test_what_one_environment_sees_does_not_change_anothers_plan():
-    agent = make_agent(toys.small_model())
-    _, first = agent.act(start(agent), OBS)
-    _, second = agent.act(start(agent), OBS.at[0].set(jnp.asarray([-0.9, 2.5])))
-    np.testing.assert_array_equal(first.action[1], second.action[1])
-    assert (first.action[0] != second.action[0]).any()
+    np.testing.assert_array_equal(first.action[1], beside.action[1])  # nor do others matter
+    assert (first.action[0] != beside.action[0]).any()
 
 
 def test_an_environment_without_finite_returns_keeps_its_plan_and_is_counted_alone():
@@ -120,7 +81,7 @@ def test_an_environment_without_finite_returns_keeps_its_plan_and_is_counted_alo
     state, seen, _ = play(agent, [1.0, 1.0], 2)
     _, healthy = agent.act(state, seen[-1])
     after, decision = agent.act(state, np.stack([[np.nan, np.nan], seen[-1][1]]))
-    np.testing.assert_array_equal(decision.failures, [TINY.num_iterations, 0])
+    np.testing.assert_array_equal(decision.failures, [toys.TINY.num_iterations, 0])
     nominal, shifted = (next(iter(s.search)) for s in (state, after))
     np.testing.assert_array_equal(decision.action[0], nominal[0, 0])
     np.testing.assert_array_equal(shifted[0, :-1], nominal[0, 1:])
@@ -163,14 +124,14 @@ def test_a_constant_observation_dimension_plans_without_failures():
 
 def test_any_function_can_be_planned_with():
     model = FunctionModel(jnp.asarray(-0.5), lambda gain, obs, action: obs + gain * action)
-    agent = Agent(model, toys.POINT, dataclasses.replace(TINY, num_particles=1))
+    agent = Agent(model, toys.POINT, dataclasses.replace(toys.TINY, num_particles=1))
     _, seen, decisions = play(agent, [-0.5], 6)
     assert decisions[-1].heads is None
     assert np.abs(seen[-1]).max() < 0.2
 
 
 def test_an_agent_without_a_model_acts_at_random():
-    agent = Agent(None, toys.POINT, TINY)
+    agent = Agent(None, toys.POINT, toys.TINY)
     _, _, decisions = play(agent, [1.0, 1.0], 50)
     actions = np.concatenate([decision.action for decision in decisions])
     assert decisions[0].heads is None
@@ -181,12 +142,8 @@ def test_an_agent_without_a_model_acts_at_random():
 
 def test_reduced_precision_chooses_nearly_the_same_actions():
     observed = np.random.default_rng(1).normal(size=(8, 3, 2)).astype(np.float32)
-    planner = {"horizon": 5, "num_candidates": 40, "optimizer": CEMConfig(num_elites=8)}
 
     def actions(**settings):
-        settings = (
-            planner | {"num_iterations": 3, "num_particles": 4, "selection_length": 10} | settings
-        )
         agent = make_agent(toys.small_model(seed=3), **settings)
         state, found = start(agent, 3), []
         for obs in observed:
@@ -194,29 +151,9 @@ def test_reduced_precision_chooses_nearly_the_same_actions():
             found.append(np.asarray(decision.action))
         return np.stack(found)
 
-    exact, reduced, other = actions(), actions(precision="bfloat16"), actions(num_candidates=41)
+    exact, reduced, other = actions(), actions(precision="bfloat16"), actions(num_candidates=61)
     difference = np.abs(exact - reduced)
     assert difference.any()
     assert np.median(difference) < 0.02
     assert difference.max() < 0.15
     assert np.median(difference) < 0.3 * np.median(np.abs(exact - other))
-
-
-def resident_kib():
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS"))
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-@pytest.mark.parametrize("plans", [2_000, pytest.param(10_000, marks=pytest.mark.slow)])
-def test_thousands_of_plans_take_no_more_memory(plans):
-    small = {"num_candidates": 8, "optimizer": CEMConfig(num_elites=2)}
-    small |= {"num_iterations": 1, "horizon": 2}
-    agent = make_agent(toys.small_model(), **small)
-    state, obs, resident = start(agent, 1), np.zeros((1, 2), np.float32), []
-    for step in range(plans):
-        state, decision = agent.act(state, obs)
-        if step % (plans // 10) == plans // 10 - 1:
-            jax.block_until_ready(decision)
-            resident.append(resident_kib())
-    assert max(resident[1:]) - resident[1] < 8 * 2**10

@@ -2,7 +2,6 @@
 
 import dataclasses
 import resource
-from typing import ClassVar
 
 import jax
 import numpy as np
@@ -11,27 +10,16 @@ import pytest
 import toys
 from headway.config import (
     CEMConfig,
-    GradientAdaptedConfig,
     ICEMConfig,
     MPPIConfig,
-    PlannerConfig,
     RandomShootingConfig,
 )
 from headway.errors import ConfigError, PlanningError
-from headway.models.grbal import GrBAL, ReluNet
-from headway.models.multi_headed import Statistics
+from headway.models.statistics import Statistics
 from headway.planning.agent import Agent
 from headway.planning.controller import Controller
 from headway.task import env_action, scaled_action
 
-TINY = PlannerConfig(
-    horizon=4,
-    num_candidates=60,
-    optimizer=CEMConfig(num_elites=10),
-    num_iterations=4,
-    num_particles=2,
-    selection_length=2,
-)
 UP_DOWN = toys.linear_model([[np.eye(2), -np.eye(2)], [-np.eye(2), np.eye(2)]])
 OBS = np.float32([0.8, -0.6])
 BLIND = np.float32([np.nan, 0.0])
@@ -57,7 +45,7 @@ class Clock:
 
 
 def make_agent(model=UP_DOWN, *, statistics=None, **settings) -> Agent:
-    return toys.make_agent(model, dataclasses.replace(TINY, **settings), statistics=statistics)
+    return toys.make_agent(model, dataclasses.replace(toys.TINY, **settings), statistics=statistics)
 
 
 @pytest.fixture
@@ -78,9 +66,7 @@ def plan_of(controller):
     return np.asarray(controller._state.search.nominal[0])
 
 
-@pytest.mark.parametrize(
-    "optimizer", [CEMConfig(), ICEMConfig(), MPPIConfig(), RandomShootingConfig()], ids=str
-)
+@pytest.mark.parametrize("optimizer", [ICEMConfig(), MPPIConfig(), RandomShootingConfig()], ids=str)
 def test_a_deadline_that_is_long_enough_changes_nothing(optimizer):
     agent, obs = make_agent(optimizer=optimizer), OBS
     plain, timed = Controller(agent), Controller(agent, deadline_ms=LONG)
@@ -129,7 +115,7 @@ def test_a_search_that_is_cut_off_answers_with_the_best_so_far(clock):
 
 def test_without_time_for_any_iteration_the_last_plan_goes_on_until_it_ends(timed, clock):
     plan = plan_of(timed)
-    for step in range(TINY.horizon - 1):
+    for step in range(toys.TINY.horizon - 1):
         clock.allow(0)
         np.testing.assert_allclose(timed.act(OBS), plan[step], atol=1e-6)
         assert timed.status.outcome == "held"
@@ -160,7 +146,7 @@ def test_with_a_deadline_nothing_is_compiled_in_service(optimizer, clock, caplog
     controller = Controller(make_agent(optimizer=optimizer), deadline_ms=LONG, clock=clock)
     with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
         for obs, times, outcome, *applied in SERVICE:
-            if times < TINY.num_iterations:
+            if times < toys.TINY.num_iterations:
                 clock.allow(times)
             controller.act(obs, applied_action=applied[0] if applied else None)
             assert controller.status.outcome == outcome
@@ -172,13 +158,14 @@ def test_with_a_deadline_nothing_is_compiled_in_service(optimizer, clock, caplog
     assert [message for message in said if "XLA" in message] == []  # shapes may be traced
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e300])
-@pytest.mark.parametrize("deadline_ms", [None, LONG])
+@pytest.mark.parametrize(("bad", "deadline_ms"), [(np.nan, None), (np.inf, LONG), (1e300, LONG)])
 def test_an_observation_that_is_not_finite_is_answered_with_the_last_plan(bad, deadline_ms):
     controller = Controller(make_agent(), deadline_ms=deadline_ms)
+    with pytest.raises(PlanningError, match=r"obs\[0\] is nan"):
+        controller.act(BLIND)
     obs = OBS + controller.act(OBS)
     plan = plan_of(controller)
-    for step in range(TINY.horizon - 1):
+    for step in range(toys.TINY.horizon - 1):
         action = controller.act(np.array([obs[0], bad]))
         np.testing.assert_allclose(action, plan[step], atol=1e-6)
         assert controller.status.outcome == "held"
@@ -195,11 +182,6 @@ def test_an_observation_that_is_not_finite_is_answered_with_the_last_plan(bad, d
     assert np.isfinite(np.asarray(controller._state.belief.recent.obs)).all()
 
 
-def test_the_first_observation_must_be_finite():
-    with pytest.raises(PlanningError, match=r"obs\[0\] is nan"):
-        Controller(make_agent()).act(np.array([np.nan, 0.0]))
-
-
 def test_a_plan_without_finite_returns_is_held_and_said():
     agent = make_agent()
     controller = Controller(agent)
@@ -212,15 +194,26 @@ def test_a_plan_without_finite_returns_is_held_and_said():
     assert controller.status.reason.startswith("none of 4 iterations")
 
 
-@pytest.mark.parametrize(
-    "obs", [np.zeros(3), np.zeros((1, 2)), np.zeros(()), [1.0, [2.0]], "x"], ids=str
-)
+def test_an_iteration_that_failed_is_no_failed_plan(monkeypatch):
+    act = Agent.act
+
+    def fails_once(*args):
+        state, decision = act(*args)
+        return state, decision._replace(failures=1 + decision.failures)
+
+    monkeypatch.setattr(Agent, "act", fails_once)
+    controller = Controller(make_agent())
+    controller.act(OBS)
+    assert (controller.status.outcome, controller.status.iterations) == ("planned", 4)
+
+
+@pytest.mark.parametrize("obs", [np.zeros(3), np.zeros((1, 2)), [1.0, [2.0]], "x"], ids=str)
 def test_an_observation_of_another_shape_is_an_error(obs):
     with pytest.raises(ConfigError, match=r"obs .*allowed"):
         Controller(make_agent()).act(obs)
 
 
-@pytest.mark.parametrize("deadline_ms", [0.0, -1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("deadline_ms", [0.0, float("nan"), float("inf")])
 def test_a_deadline_is_a_time(deadline_ms):
     with pytest.raises(ConfigError, match="deadline_ms is"):
         Controller(make_agent(), deadline_ms=deadline_ms)
@@ -231,18 +224,20 @@ def test_observations_unlike_the_training_data_are_named():
     for trajectory in trajectories:
         trajectory.obs[:, 1] = 0.5
     statistics = Statistics.fit(toys.POINT, trajectories, 3)
-    controller = Controller(make_agent(toys.small_model(), statistics=statistics))
     mean, std = (float(x[0]) for x in (statistics.features.mean, statistics.features.std))
-    controller.act(np.array([mean + 9.9 * std, 0.5]))
-    assert controller.status.warnings == ()
-    controller.act(np.array([mean - 12 * std, 0.4]))
-    first, second = controller.status.warnings
+    agent = make_agent(toys.small_model(), statistics=statistics)
+
+    def warnings_of(obs, **settings):
+        controller = Controller(agent, **settings)
+        controller.act(obs)
+        assert controller.status.outcome == "planned"
+        return controller.status.warnings
+
+    assert warnings_of([mean + 9.9 * std, 0.5]) == ()
+    first, second = warnings_of([mean - 12 * std, 0.4])
     assert first == "feature 0 is 12 standard deviations from its mean in training, allowed: 10"
     assert second.startswith("feature 1 is off by 0.1 from 0.5, its only value")
-    assert controller.status.outcome == "planned"
-    quiet = Controller(controller.agent, max_deviations=None)
-    quiet.act(np.array([mean - 12 * std, 0.4]))
-    assert quiet.status.warnings == ()
+    assert warnings_of([mean - 12 * std, 0.4], max_deviations=None) == ()
 
 
 def memory() -> int:
@@ -250,7 +245,10 @@ def memory() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-@pytest.mark.parametrize(("deadline_ms", "steps"), [(None, 1000), (LONG, 400)])
+@pytest.mark.parametrize(
+    ("deadline_ms", "steps"),
+    [(None, 1000), (LONG, 400), pytest.param(None, 10_000, marks=pytest.mark.slow)],
+)
 def test_many_steps_take_no_more_memory(deadline_ms, steps):
     controller = Controller(make_agent(num_iterations=2), deadline_ms=deadline_ms)
     rng = np.random.default_rng(0)
@@ -274,8 +272,8 @@ def test_many_steps_take_no_more_memory(deadline_ms, steps):
 class Valves(toys.PointTask):
     """The same point, pushed in other units."""
 
-    action_low: ClassVar[tuple[float, ...]] = (-2.0, 0.0)
-    action_high: ClassVar[tuple[float, ...]] = (2.0, 40.0)
+    action_low = (-2.0, 0.0)
+    action_high = (2.0, 40.0)
 
 
 TASK = Valves()
@@ -284,7 +282,7 @@ TASK = Valves()
 @pytest.fixture
 def valves():
     statistics = toys.identity_statistics(TASK)
-    planner = dataclasses.replace(TINY, selection_length=3)
+    planner = dataclasses.replace(toys.TINY, selection_length=3)
     return Controller(toys.make_agent(UP_DOWN, planner, statistics=statistics, task=TASK))
 
 
@@ -312,16 +310,6 @@ def test_nothing_is_learned_from_a_step_whose_action_is_not_known(valves):
     assert np.isfinite(np.asarray(valves._state.belief.recent.action)).all()
 
 
-def test_a_model_that_adapts_learns_from_what_was_applied():
-    config = GradientAdaptedConfig(hidden_sizes=(4,))
-    net = ReluNet.init(config, TASK, key=jax.random.key(0))
-    model = GrBAL(net, toys.identity_statistics(TASK), TASK, 2, 0.1)
-    controller = Controller(Agent(model, TASK, TINY))
-    controller.act(OBS)
-    controller.act(OBS, applied_action=[1.0, 10.0])
-    np.testing.assert_allclose(controller._state.belief.action[0, -1], [0.5, -0.5], atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("applied", "message"),
     [
@@ -345,7 +333,7 @@ def test_what_cannot_be_an_action_is_an_error_and_changes_nothing(applied, messa
 
 
 def test_random_actions_have_no_deadline_but_their_applied_actions_are_checked():
-    agent = Agent(None, TASK, TINY)
+    agent = Agent(None, TASK, toys.TINY)
     with pytest.raises(ConfigError, match=r"is 50, but random makes no plan .*allowed: None"):
         Controller(agent, deadline_ms=50.0)
     controller = Controller(agent)

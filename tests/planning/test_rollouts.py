@@ -1,6 +1,6 @@
 """Imagined rollouts against NumPy ones."""
 
-from typing import ClassVar
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -8,38 +8,37 @@ import numpy as np
 import pytest
 
 import toys
-from headway.config import PlannerConfig
-from headway.models.acting import MultiHeadModel, fold
-from headway.models.multi_headed import MultiHeadDynamics
-from headway.models.networks import DenseHeads, GaussianNet
+from headway.config import (
+    CEMConfig,
+    ICEMConfig,
+    MPPIConfig,
+    MultiHeadedConfig,
+    PlannerConfig,
+    RandomShootingConfig,
+)
+from headway.models.folding import fold
+from headway.models.multi_headed import MultiHeadNet
 from headway.planning import cpu
-from headway.planning.rollouts import candidate_returns
+from headway.planning.rollouts import candidate_returns, plan_flop
+from headway.task import env_spec
 
 KEY = jax.random.key(0)
 UNIT = {"low": np.array([-1.0, -1.0]), "high": np.array([1.0, 1.0])}
 CORNER = {"low": np.array([-2.0, 0.0]), "high": np.array([2.0, 3.0])}
 
 
-class CornerTask(toys.PointTask):
-    """Actions in other units; an episode ends when the first number exceeds one."""
+class CornerTask(toys.ScaledTask):
+    """Its network sees plain observations; its reward may overflow."""
 
-    action_low: ClassVar[tuple[float, ...]] = (-2.0, 0.0)
-    action_high: ClassVar[tuple[float, ...]] = (2.0, 3.0)
+    def preprocess(self, obs):
+        return obs
 
     def reward(self, obs, action, next_obs):
         return obs[..., 0] + jnp.square(next_obs[..., 1]) - 0.3 * action[..., 0] + action[..., 1]
 
-    def released_reward(self, obs, action, next_obs):
-        return obs[..., 0]
-
-    def terminated(self, obs, action, next_obs):
-        return next_obs[..., 0] > 1.0
-
 
 def dynamics_of(net, heads, context=None, task=toys.POINT):
-    planner = PlannerConfig(num_particles=2)
-    model = MultiHeadModel(net, toys.identity_statistics(task), task, planner, 3)
-    return fold(model, jnp.asarray(heads), context)
+    return fold(net.forward_net, toys.identity_statistics(task), task, jnp.asarray(heads), context)
 
 
 def returns_of(dynamics, obs, candidates, task=toys.POINT, *, key=KEY, particles=2, **settings):
@@ -129,12 +128,8 @@ def test_particles_stay_with_their_member_for_the_whole_horizon():
 def random_walk_dynamics(std, num_heads=1):
     """A model that never moves but for its noise, equally for each head."""
     net = toys.linear_model(np.zeros((1, num_heads, 2, 2))).forward_net
-    logvar = DenseHeads(
-        jnp.zeros(net.mean_heads.weight.shape), jnp.full((1, num_heads, 2), 2 * np.log(std))
-    )
-    bounds = jnp.full((num_heads, 2), 20.0), jnp.full((num_heads, 2), -40.0)
-    net = GaussianNet(net.hidden, net.mean_heads, logvar, *bounds)
-    return dynamics_of(MultiHeadDynamics(net, None, None), [[list(range(num_heads))]])
+    noisy = MultiHeadNet(toys.with_noise(net, [std] * num_heads), None, None)
+    return dynamics_of(noisy, [[list(range(num_heads))]])
 
 
 @pytest.mark.parametrize(
@@ -149,15 +144,6 @@ def test_noise_is_drawn_afresh_at_every_step_and_averages_out_over_heads(num_hea
     spread = -2 * std**2 * sum(range(1, horizon + 1)) / num_heads
     np.testing.assert_allclose(got, [[spread, spread]], rtol=0.08)
     assert (got[0, 0] == got[0, 1]) == (noise == "shared")  # equal candidates have equal luck
-
-
-def test_noise_depends_on_the_key_only():
-    candidates, dynamics = np.zeros((1, 1, 3, 2), np.float32), random_walk_dynamics(0.2)
-    first, again, other = (
-        returns_of(dynamics, np.zeros((1, 2)), candidates, key=jax.random.key(k)) for k in (1, 1, 2)
-    )
-    assert first == again
-    assert first != other
 
 
 def some_dynamics(num_envs, seed=3):
@@ -186,13 +172,61 @@ def test_on_other_devices_than_cpus_the_same_noise_is_drawn_step_by_step(monkeyp
     assert len(set(found[0].tolist())) == 3
 
 
-def test_an_environments_returns_do_not_depend_on_its_neighbours():
+def test_an_environments_returns_do_not_depend_on_its_neighbours_but_on_the_key():
     heads, context = np.zeros((3, 2, 1), int), jnp.ones((2, 3, 3))
     candidates = np.random.default_rng(4).uniform(-1, 1, (3, 4, 5, 2)).astype(np.float32)
-    together = returns_of(
-        dynamics_of(toys.small_model(), heads, context), np.ones((3, 2)), candidates
+    net = toys.small_model()
+    dynamics = dynamics_of(net, heads, context)
+    together, other = (
+        returns_of(dynamics, np.ones((3, 2)), candidates, key=jax.random.key(k)) for k in (0, 1)
     )
-    alone = dynamics_of(toys.small_model(), heads[:1], context[:, :1])
+    alone = dynamics_of(net, heads[:1], context[:, :1])
     single = returns_of(alone, np.ones((1, 2)), candidates[:1])
     np.testing.assert_allclose(together[:1], single, rtol=1e-5)
     assert not np.allclose(together[0], together[1])
+    assert not np.allclose(together, other)
+
+
+# The cost of a plan, counted by hand.
+
+MODEL = MultiHeadedConfig(hidden_sizes=(8, 6), num_heads=3)
+CEM = CEMConfig(num_elites=8)
+PLANNER = PlannerConfig(
+    horizon=5, num_candidates=40, num_iterations=3, num_particles=10, optimizer=CEM
+)
+PER_STEP = 2 * (4 * 8 + 8 * 6 + 6 * 4)  # two observations and two actions; mean and variance
+
+
+def test_arithmetic_of_the_papers_half_cheetah():
+    task = env_spec("half-cheetah").make_task()
+    assert plan_flop(MultiHeadedConfig(), PlannerConfig(), task) == pytest.approx(158.4e9)
+
+
+@pytest.mark.parametrize(
+    ("model", "planner", "per_step"),
+    [
+        ({}, {}, PER_STEP),
+        ({"context": "history", "context_at": "input"}, {}, PER_STEP),  # it costs nothing
+        ({"deterministic": True}, {}, PER_STEP - 2 * 6 * 2),
+        ({}, {"head_selection": "average"}, PER_STEP + 2 * 6 * 2 * 2),
+    ],
+    ids=str,
+)
+def test_arithmetic_of_an_imagined_step(model, planner, per_step):
+    model, planner = dataclasses.replace(MODEL, **model), dataclasses.replace(PLANNER, **planner)
+    assert plan_flop(model, planner, toys.POINT, 1.5) == 1.5 * 10 * 5 * per_step
+
+
+@pytest.mark.parametrize(
+    ("optimizer", "evaluations"),
+    [
+        (CEM, 120),
+        (MPPIConfig(), 120),
+        (RandomShootingConfig(), 120),
+        (ICEMConfig(num_elites=8), 40 + 32 + 25 + 3 * 2 + 1),
+    ],
+    ids=str,
+)
+def test_arithmetic_of_a_plan_of_each_optimizer(optimizer, evaluations):
+    planner = dataclasses.replace(PLANNER, optimizer=optimizer)
+    assert plan_flop(MODEL, planner, toys.POINT) == evaluations * 10 * 5 * PER_STEP

@@ -7,7 +7,7 @@ import pytest
 
 from headway.config import Config
 from headway.errors import ConfigError, UnknownNameError
-from headway.planning.flop import plan_flop
+from headway.planning.rollouts import plan_flop
 from headway.task import env_names, env_spec
 from headway.training.evaluate import group_episodes
 from headway.training.methods import METHODS, PRESETS, config_to_evaluate, make_config

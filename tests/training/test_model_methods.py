@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import headway
+import toys
 from headway.data import Trajectory
-from headway.models.multi_headed import network_input
+from headway.models.statistics import network_input
 from headway.training.methods import make_config, told_sim_params
 from headway.training.trainers import make_trainer
 
@@ -60,7 +61,7 @@ def fitted_error(method):
     context = model.context(past, statistics, episodes.sim_params[row])
     obs, next_obs = episodes.obs[row, step], episodes.obs[row, step + 1]
     x = network_input(trainer.task, statistics, obs, episodes.action[row, step])
-    mean = model.forward_net(x, context).mean[0, 0, :, 2]
+    mean = toys.predict(model.forward_net, x, context).mean[0, 0, :, 2]
     delta = np.asarray(next_obs - obs)[0, :, 2]
     got = np.asarray(mean) * statistics.delta.std[2] + statistics.delta.mean[2]
     return float(np.square(got - delta).mean() / delta.var())

@@ -8,7 +8,7 @@ import pytest
 import toys
 from headway.config import CEMConfig, PlannerConfig
 from headway.data import History, Trajectory
-from headway.models.multi_headed import Statistics, network_input
+from headway.models.statistics import Statistics, network_input
 from headway.training.selection import EpisodeSelection, examine, summarise
 
 TINY = PlannerConfig(
@@ -58,7 +58,8 @@ def test_it_examines_what_the_acting_agent_decided():
     context = agent.model.net.context(History(*history), statistics)
     last = trajectory.obs[8:9], trajectory.action[8:9]
     x = network_input(toys.POINT, statistics, *map(jnp.asarray, last))
-    prediction = agent.model.net.forward_net(jnp.broadcast_to(x, (2, *x.shape)), context)
+    wide = jnp.broadcast_to(x, (2, *x.shape))
+    prediction = toys.predict(agent.model.net.forward_net, wide, context)
     delta = statistics.delta.normalize(jnp.asarray(np.diff(trajectory.obs[8:], axis=0)))
     difference = np.asarray(delta - prediction.mean)[:, :, 0]
     np.testing.assert_allclose(found.errors[-1], np.square(difference).mean(-1), rtol=1e-4)

@@ -12,7 +12,7 @@ from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import ConfigError
 from headway.lab.tables import COLLECTED, distinct, full_label, group_label, new_table, varying
-from headway.models.acting import MultiHeadModel
+from headway.models.multi_headed import MultiHeadModel
 from headway.task import sim_param_sets
 from headway.training import selection
 from headway.training.evaluate import evaluate, known_groups

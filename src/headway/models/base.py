@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from headway.config import Precision
-from headway.data import History
+from headway.data import History, where_env
 from headway.models.networks import PRECISIONS, Dense, rounded
 from headway.task import Task
 
@@ -48,9 +48,10 @@ class Dynamics(eqx.Module):
     """The arrays that differ between environments; these lead."""
 
     @property
-    @abc.abstractmethod
     def widest(self) -> int:
         """Numbers in the widest layer of one step; decides how much is imagined at once."""
+        parts = jax.tree.leaves(self, is_leaf=lambda part: isinstance(part, Layer))
+        return max(part.bias.shape[-1] for part in parts if isinstance(part, Layer))
 
     @property
     def num_members(self) -> int:
@@ -68,7 +69,6 @@ class Dynamics(eqx.Module):
 
     def of_member(self, member: Int[Array, ""]) -> "Dynamics":
         """One member of an ensemble; arrays keep that axis. Called after `of_env`."""
-        del member
         return self
 
     def start(self) -> Any:
@@ -113,20 +113,23 @@ class Model(eqx.Module):
         """Past transitions that a belief depends on at most; None: the whole episode."""
         return None
 
-    @abc.abstractmethod
     def init_belief(
         self, num_envs: int, sim_params: Float[Array, "env sim_param"] | None = None
     ) -> Any:
-        """The belief at the beginning of an episode, before the first `observe`.
+        """The belief at the beginning of an episode, before the first `observe`; by default none.
 
         Args:
             num_envs: Number of environments.
             sim_params: The values of `sim_param_names`; None where there are none.
         """
+        return ()
 
-    @abc.abstractmethod
     def observe(self, belief: Any, transition: Transition, keys: Keys) -> Any:
-        """The belief after a transition, or at a first observation (`happened` is False)."""
+        """The belief after a transition, or at a first observation (`happened` is False).
+
+        By default nothing is learned.
+        """
+        return belief
 
     @abc.abstractmethod
     def dynamics(self, belief: Any, precision: Precision = "float32") -> Any:
@@ -155,14 +158,12 @@ class RecentTransitions(NamedTuple):
 
     def push(self, transition: Transition) -> "RecentTransitions":
         """Append a transition where it happened; the oldest falls out."""
-        happened = transition.happened
-
-        def shift(slots, newest):
-            moved = jnp.concatenate([slots[:, 1:], newest[:, None]], axis=1)
-            return jnp.where(happened[:, None, None], moved, slots)
-
-        obs, action, next_obs = map(shift, self[:3], transition[:3])
-        return RecentTransitions(obs, action, next_obs, self.count + happened)
+        obs, action, next_obs = (
+            jnp.concatenate([slots[:, 1:], newest[:, None]], axis=1)
+            for slots, newest in zip(self[:3], transition[:3], strict=True)
+        )
+        pushed = RecentTransitions(obs, action, next_obs, self.count + 1)
+        return where_env(transition.happened, pushed, self)
 
     def history(self, length: int) -> History:
         """The last K transitions as the context encoder wants them: filled from the left."""
@@ -255,19 +256,8 @@ class FunctionModel(Model):
     predict: Callable[[Any, Array, Array], Array] = eqx.field(static=True)
     widest: int = eqx.field(static=True, default=256)
 
-    def init_belief(self, num_envs: int, sim_params: None = None) -> tuple[()]:
-        """Nothing."""
-        del num_envs, sim_params
-        return ()
-
-    def observe(self, belief: tuple[()], transition: Transition, keys: Keys) -> tuple[()]:
-        """Nothing is learned."""
-        del transition, keys
-        return belief
-
     def dynamics(self, belief: tuple[()], precision: Precision = "float32") -> "FunctionDynamics":
         """The function; its precision is its own."""
-        del precision
         return FunctionDynamics(belief, self.parameters, self.predict, self.widest)
 
 
@@ -285,5 +275,4 @@ class FunctionDynamics(Dynamics):
 
     def step(self, carry, obs, action, noise):
         """See `Dynamics.step`."""
-        del noise
         return carry, over_rows(functools.partial(self.predict, self.parameters))(obs, action)

@@ -1,9 +1,8 @@
 """JAX's settings for a run, and the compiler options of functions that run the networks."""
 
+import contextlib
 import functools
 import os
-import threading
-import typing
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -55,7 +54,11 @@ def prepare_jax() -> None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
     name = "jax_persistent_cache_min_compile_time_secs"
     folder, kept_from = str(settings.jax_compilation_cache_dir), getattr(settings, name)
-    if not _can_write(folder):
+    in_cloud = "://" in folder
+    if not in_cloud:
+        with contextlib.suppress(OSError):
+            Path(folder).mkdir(parents=True, exist_ok=True)
+    if not (in_cloud or os.access(folder, os.W_OK | os.X_OK)):
         if kept_from != float("inf"):
             warnings.warn(
                 f"compiled programs cannot be kept in {folder}, so every process compiles again;"
@@ -67,16 +70,6 @@ def prepare_jax() -> None:
         jax.config.update("jax_enable_compilation_cache", Path(folder).is_dir())
     elif kept_from == _JAX_KEEPS and name.upper() not in os.environ:
         jax.config.update(name, _KEPT)
-
-
-def _can_write(folder: str) -> bool:
-    if "://" in folder:  # in a cloud
-        return True
-    try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return False
-    return os.access(folder, os.W_OK | os.X_OK)
 
 
 @functools.cache
@@ -99,21 +92,19 @@ def jit_networks(function: Callable, *, precision: Precision = "float32") -> Cal
 
     The function is wrapped when first called, so that importing does not start JAX's backend.
     """
-    lock, compiled = threading.Lock(), None
+
+    @functools.cache
+    def compiled() -> Callable:
+        options: Any = {"compiler_options": compiler_options(precision)}
+        return eqx.filter_jit(function, **options)
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        nonlocal compiled
-        with lock:  # several threads plan
-            if compiled is None:
-                options: Any = {"compiler_options": compiler_options(precision)}
-                compiled = eqx.filter_jit(function, **options)
-        return compiled(*args, **kwargs)
+        return compiled()(*args, **kwargs)
 
     return call
 
 
 def in_each_precision(function: Callable) -> dict[Precision, Callable]:
     """A function that runs the networks, compiled for products of each precision."""
-    precisions: tuple[Precision, ...] = typing.get_args(Precision)
-    return {one: jit_networks(function, precision=one) for one in precisions}
+    return {one: jit_networks(function, precision=one) for one in _WANTED}

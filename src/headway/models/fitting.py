@@ -26,8 +26,9 @@ from headway.models.losses import (
     sum_of_squares,
     total_loss,
 )
-from headway.models.multi_headed import MultiHeadDynamics, Statistics
-from headway.models.ria import add_parts, intervene, relation_gradient, relation_parts
+from headway.models.multi_headed import MultiHeadNet
+from headway.models.ria import intervene, relation_gradient, relation_parts
+from headway.models.statistics import Statistics
 from headway.task import Task
 
 ROUNDS = 32
@@ -81,7 +82,8 @@ class FitState(eqx.Module):
                 return FitState(model, optimizer)
             moments: Any = self.relation_optimizer
             changes, moments = adam.update(relation_grads, moments)
-            return FitState(add_parts(model, changes), optimizer, moments)
+            parts: Any = eqx.apply_updates(relation_parts(model), changes)
+            return FitState(eqx.tree_at(relation_parts, model, parts), optimizer, moments)
 
         leaves = jax.tree.leaves((grads, relation_grads))
         size = sum((sum_of_squares(leaf) for leaf in leaves), jnp.zeros(()))
@@ -179,7 +181,7 @@ class FitSetup(eqx.Module):
 
 
 def assign_segments(
-    model: MultiHeadDynamics, setup: FitSetup, episodes: Episodes, statistics: Statistics
+    model: MultiHeadNet, setup: FitSetup, episodes: Episodes, statistics: Statistics
 ) -> Assignment:
     """Find the best head of every segment of every episode (paper, section 3).
 
@@ -208,7 +210,7 @@ def assign_segments(
 
 
 def episode_losses(
-    model: MultiHeadDynamics,
+    model: MultiHeadNet,
     setup: FitSetup,
     episodes: Episodes,
     episode: int | Int[Array, ""],

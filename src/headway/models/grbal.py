@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from headway.config import ModelConfig, Precision
+from headway.data import where_env
 from headway.models.base import (
     Dynamics,
     Keys,
@@ -26,8 +27,8 @@ from headway.models.base import (
 )
 from headway.models.compilation import jit_networks
 from headway.models.fitting import EpochStats, FitData, FitSetup, FitState, run_updates
-from headway.models.multi_headed import Statistics, network_input
 from headway.models.networks import Dense
+from headway.models.statistics import Statistics, network_input
 from headway.task import Task
 
 
@@ -204,14 +205,12 @@ class GrBAL(Model):
 
     def init_belief(self, num_envs: int, sim_params: None = None) -> RecentTransitions:
         """See `Model.init_belief`: the transitions to adapt to."""
-        del sim_params
         return RecentTransitions.empty(num_envs, self.length, self.task)
 
     def observe(
         self, belief: RecentTransitions, transition: Transition, keys: Keys
     ) -> RecentTransitions:
         """See `Model.observe`."""
-        del keys
         return belief.push(transition)
 
     def dynamics(
@@ -220,12 +219,7 @@ class GrBAL(Model):
         """See `Model.dynamics`: the weights of every environment, adapted."""
         past = Window.of(self.task, self.statistics, belief[:3], jnp.ones(belief.obs.shape[:2]))
         adapted = jax.vmap(lambda past: adapt(self.net, past, self.rate))(past)
-        enough = belief.count >= self.length
-
-        def choose(adapted, meta_learned):
-            return jnp.where(enough.reshape(-1, *[1] * meta_learned.ndim), adapted, meta_learned)
-
-        net = jax.tree.map(choose, adapted, self.net)
+        net = where_env(belief.count >= self.length, adapted, self.net)
         layers = plan_layers((*net.hidden, net.output), precision)
         return AdaptedDynamics(layers, self.statistics, self.task)
 
@@ -237,14 +231,8 @@ class AdaptedDynamics(Dynamics):
     statistics: Statistics
     task: Task
 
-    @property
-    def widest(self) -> int:
-        """See `Dynamics.widest`."""
-        return max(layer.bias.shape[-1] for layer in self.own)
-
     def step(self, carry, obs, action, noise):
         """See `Dynamics.step`."""
-        del noise
         x = wide_input(self.task, self.statistics, obs, action)
         *hidden, output = self.own
         for layer in hidden:

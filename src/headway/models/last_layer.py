@@ -28,6 +28,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from headway.data import where_env
+
 GATE = 100.0
 """Deviations of the training data's deltas; larger residuals of a head count as this large, and
 a transition that no head finds smaller teaches nothing."""
@@ -139,20 +141,18 @@ def observe(
         cusum = layer.cusum + jnp.minimum(log_bayes_factor, most)
         changed = cusum > change_threshold
         layer = layer._replace(cusum=jnp.maximum(cusum, 0.0))
-        layer = jax.tree.map(
-            lambda x, y: jnp.where(changed.reshape(-1, *[1] * (x.ndim - 1)), x, y), fresh, layer
-        )
+        layer = where_env(changed, fresh, layer)
         outlier = (log_bayes_factor > most) & ~changed
-        variance = 1.0 + predict(layer, seen).variance
+        variance = 1.0 + innovate(layer, seen).variance
         more = variance / robust_weight(layer, prior, seen) - variance
         noise += jnp.where(outlier[:, None], more, 0.0)
     return update(layer, seen, noise)
 
 
-class Prediction(NamedTuple):
-    """Prediction of a transition before it is learned from."""
+class Innovation(NamedTuple):
+    """New information of a transition, as in a Kalman filter."""
 
-    innovation: Float[Array, "env member head obs"]
+    error: Float[Array, "env member head obs"]
     """The residual minus the correction's mean, r - φᵀw."""
     projected: Float[Array, "env member feature"]
     """Sᵀφ."""
@@ -160,11 +160,11 @@ class Prediction(NamedTuple):
     """Parameter uncertainty φᵀPφ = |Sᵀφ|², in units of σ²."""
 
 
-def predict(layer: LastLayer, seen: Residuals) -> Prediction:
-    """Predict a transition with the posterior so far."""
+def innovate(layer: LastLayer, seen: Residuals) -> Innovation:
+    """Compare a transition with its prediction by the posterior so far."""
     projected = jnp.einsum("emij,emi->emj", layer.root, seen.features)
-    innovation = seen.residual - layer.correction(seen.features)
-    return Prediction(innovation, projected, jnp.square(projected).sum(-1))
+    error = seen.residual - layer.correction(seen.features)
+    return Innovation(error, projected, jnp.square(projected).sum(-1))
 
 
 def update(layer: LastLayer, seen: Residuals, noise: Float[Array, "env member"]) -> LastLayer:
@@ -178,14 +178,14 @@ def update(layer: LastLayer, seen: Residuals, noise: Float[Array, "env member"])
         seen: The transitions, gated.
         noise: Relative variance n of their noise.
     """
-    innovation, projected, variance = predict(layer, seen)
+    error, projected, variance = innovate(layer, seen)
     spread = noise + variance
     gain = jnp.einsum("emij,emj->emi", layer.root, projected) / spread[..., None]
-    weight = layer.weight + gain[:, :, None, :, None] * innovation[..., None, :]
+    weight = layer.weight + gain[:, :, None, :, None] * error[..., None, :]
     share = 1.0 / (1.0 + jnp.sqrt(noise / spread))
     lost = share[..., None, None] * gain[..., :, None] * projected[..., None, :]
     learned = seen.features[..., -1]  # 1, or 0 where there is nothing to learn
-    squares = jnp.square(innovation) * (learned / spread)[..., None, None]
+    squares = jnp.square(error) * (learned / spread)[..., None, None]
     return LastLayer(
         weight, layer.root - lost, layer.squares + squares, layer.count + learned, layer.cusum
     )
@@ -200,9 +200,9 @@ def log_likelihood(
     transitions, predictions follow Student's t-distribution (Bishop, 2006, section 2.3.7). So
     heads that are wrong throughout an episode are not surprised by each error.
     """
-    innovation, dof, var = _student_t(layer, prior, seen)
+    error, dof, var = _student_t(layer, prior, seen)
     dof = dof[..., None, None]
-    tail = jnp.log1p(jnp.square(innovation) / (dof * var))
+    tail = jnp.log1p(jnp.square(error) / (dof * var))
     gamma = jax.scipy.special.gammaln
     scale = gamma(0.5 * (dof + 1.0)) - gamma(0.5 * dof) - 0.5 * jnp.log(jnp.pi * dof * var)
     return (scale - 0.5 * (dof + 1.0) * tail).sum(-1)
@@ -213,9 +213,9 @@ def robust_weight(layer: LastLayer, prior: Prior, seen: Residuals) -> Float[Arra
 
     1 up to one standard deviation. Heads share it, as the best of them has it.
     """
-    innovation, dof, var = _student_t(layer, prior, seen)
-    error = (jnp.square(innovation) / var).mean(-1).min(-1)
-    return jnp.clip((dof + 1.0) / (dof + error), TINY, 1.0)
+    error, dof, var = _student_t(layer, prior, seen)
+    least = (jnp.square(error) / var).mean(-1).min(-1)
+    return jnp.clip((dof + 1.0) / (dof + least), TINY, 1.0)
 
 
 def _student_t(
@@ -225,8 +225,8 @@ def _student_t(
     Float[Array, "env member"],
     Float[Array, "env member head obs"],
 ]:
-    """Innovation, degrees of freedom and squared scale of a prediction."""
-    innovation, _, variance = predict(layer, seen)
+    """Error, degrees of freedom and squared scale of a prediction."""
+    error, _, variance = innovate(layer, seen)
     dof = NOISE_DOF + layer.count
     noise = (NOISE_DOF * prior.noise[:, None] + layer.squares) / dof[..., None, None]
-    return innovation, dof, jnp.maximum((1.0 + variance)[..., None, None] * noise, TINY)
+    return error, dof, jnp.maximum((1.0 + variance)[..., None, None] * noise, TINY)

@@ -34,7 +34,8 @@ from threadpoolctl import threadpool_limits
 from headway.data import Episodes, Trajectory
 from headway.errors import ConfigError
 from headway.models.last_layer import Prior, Residuals
-from headway.models.multi_headed import MultiHeadDynamics, Statistics
+from headway.models.multi_headed import MultiHeadNet
+from headway.models.statistics import Statistics
 from headway.task import Task
 
 RATIOS = np.geomspace(1e-5, 1e6, 45)
@@ -53,7 +54,7 @@ GOLDEN = (5**0.5 - 1) / 2
 
 
 def fit_prior(
-    model: MultiHeadDynamics,
+    model: MultiHeadNet,
     task: Task,
     statistics: Statistics,
     trajectories: Sequence[Trajectory],
@@ -134,7 +135,7 @@ def fit_prior(
 
 @eqx.filter_jit
 def residuals_of(
-    model: MultiHeadDynamics,
+    model: MultiHeadNet,
     task: Task,
     statistics: Statistics,
     episode: Episodes,
@@ -229,5 +230,4 @@ def validation_moments(length: int, episode: int) -> list[int]:
 def evenly_spread(items: Sequence[Trajectory], most: int) -> list[Trajectory]:
     """At most so many, evenly spread."""
     count = len(items)
-    places = np.linspace(0, count - 1, min(count, most)).round().astype(int)
-    return [items[i] for i in sorted({*places.tolist()})]
+    return [items[i] for i in np.linspace(0, count - 1, min(count, most)).round().astype(int)]

@@ -11,8 +11,9 @@ from jaxtyping import Array, Float, Int
 
 from headway.config import FittingConfig
 from headway.data import History
-from headway.models.multi_headed import MultiHeadDynamics, Statistics, network_input
+from headway.models.multi_headed import MultiHeadNet
 from headway.models.networks import ContextEncoder, GaussianNet, Prediction
+from headway.models.statistics import Statistics, network_input
 from headway.task import Task
 
 HIDDEN_DECAY = (2.5e-5, 5e-5, 7.5e-5)
@@ -67,7 +68,7 @@ def negative_log_likelihood(
 
 
 def head_losses(
-    model: MultiHeadDynamics, task: Task, statistics: Statistics, batch: Batch
+    model: MultiHeadNet, task: Task, statistics: Statistics, batch: Batch
 ) -> HeadLosses:
     """Loss of every head on every sample, with the context of the sample's history."""
     context = model.context(batch.history, statistics, batch.sim_params)
@@ -75,7 +76,7 @@ def head_losses(
     def losses(net: GaussianNet, start, end, delta) -> Float[Array, "member head sample"]:
         x = network_input(task, statistics, start, batch.action)
         target = delta.normalize(task.target(start, end)).mT
-        prediction = net.columns(x.mT, None if context is None else context.mT)
+        prediction = net(x.mT, None if context is None else context.mT)
         return negative_log_likelihood(prediction, target[:, None], axis=-2)
 
     forward = losses(model.forward_net, batch.obs, batch.next_obs, statistics.delta)
@@ -126,7 +127,7 @@ def oracle_loss(
 
 
 def total_loss(
-    model: MultiHeadDynamics,
+    model: MultiHeadNet,
     losses: HeadLosses,
     assignment: Assignment | None,
     weight: Float[Array, "member sample"],
@@ -177,7 +178,7 @@ def weight_decay_loss(net: GaussianNet | ContextEncoder) -> Float[Array, ""]:
     return 0.5 * jnp.stack([c * sum_of_squares(layer.weight) for c, layer in weighted]).sum()
 
 
-def model_decay_loss(model: MultiHeadDynamics, *, context: bool) -> Float[Array, ""]:
+def model_decay_loss(model: MultiHeadNet, *, context: bool) -> Float[Array, ""]:
     """Weight decay of every network; the context encoder's only if `context`."""
     nets = [model.forward_net, model.backward_net, model.context_encoder if context else None]
     return sum((weight_decay_loss(net) for net in nets if net is not None), jnp.zeros(()))

@@ -1,9 +1,9 @@
-"""Networks of an ensemble: normaliser, layers in a precision, heads with variances, encoder.
+"""Networks of an ensemble: layers in a precision, heads with variances, context encoder.
 
 Members are a leading axis of every array: a batched matrix product over members runs at the
 processor's full rate, so the member axis stays inside the layers; heads are folded into one
-product per network as well. Methods named `columns` take features before samples, which is faster
-for layers in a row (docs/performance.md).
+product per network as well. Features before samples are faster for layers in a row
+(docs/performance.md); methods named `columns` take them so.
 
 Reduced precision rounds what is multiplied; sums are always float32. On CPUs XLA multiplies
 bfloat16 fast (YNNPACK) only where the first factor lies row by row in memory: with features before
@@ -27,49 +27,6 @@ from headway.task import Task
 PRECISIONS = {"float32": jnp.float32, "bfloat16": jnp.bfloat16}
 
 
-class Normalizer(eqx.Module):
-    """Shifts and scales features to zero mean and unit variance (released `tmcl.py`).
-
-    A feature that never varied has `std` 0: it is shifted but not scaled, and
-    `denormalize` gives back its mean whatever the network says.
-    """
-
-    mean: Float[Array, "*size"]
-    std: Float[Array, "*size"]
-
-    @classmethod
-    def identity(cls, *size: int) -> "Normalizer":
-        """A normaliser that changes nothing."""
-        return cls(jnp.zeros(size), jnp.ones(size))
-
-    @classmethod
-    def fit(cls, values: Float[np.ndarray, "count size"]) -> "Normalizer":
-        """Take mean and standard deviation of values, in float64."""
-        values = np.asarray(values, np.float64)
-        return cls.of_moments(values.mean(0), values.std(0))
-
-    @classmethod
-    def of_moments(cls, mean: np.ndarray, std: np.ndarray) -> "Normalizer":
-        """Build from moments computed in float64; what float32 can't resolve is constant."""
-        constant = std <= 1e-5 * np.maximum(np.abs(mean), 1e-12)
-        return cls(
-            jnp.asarray(mean, jnp.float32), jnp.asarray(np.where(constant, 0, std), jnp.float32)
-        )
-
-    @property
-    def scale(self) -> Float[Array, "*size"]:
-        """Divisor of `normalize`: the standard deviation, or 1 where it is 0."""
-        return jnp.where(self.std > 0, self.std + 1e-10, 1.0)
-
-    def normalize(self, values: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
-        """Scale values to zero mean and unit variance."""
-        return (values - self.mean) / self.scale
-
-    def denormalize(self, values: Float[Array, "*batch size"]) -> Float[Array, "*batch size"]:
-        """Undo `normalize`."""
-        return values * self.std + self.mean
-
-
 def affine(
     x: Float[Array, "member in batch"],
     weight: Float[Array, "member in out"],
@@ -83,11 +40,7 @@ def affine(
 
 
 @jax.custom_vjp
-def _reduced(
-    x: Float[Array, "member in batch"],
-    weight: Float[Array, "member in out"],
-    bias: Float[Array, "member out"],
-) -> Float[Array, "member out batch"]:
+def _reduced(x, weight, bias):
     return _forward(x, weight, bias)[0]
 
 
@@ -131,17 +84,26 @@ def row_by_row(x: Float[Array, "member row column"]) -> Float[Array, "member row
 
 
 class Dense(eqx.Module):
-    """One linear layer for every member."""
+    """One linear layer for every member, or for every member and head, over the same inputs."""
 
-    weight: Float[Array, "member in out"]
-    bias: Float[Array, "member out"]
+    weight: Float[Array, "member *head in out"]
+    bias: Float[Array, "member *head out"]
     precision: Precision = eqx.field(static=True, default="float32")
 
     @classmethod
-    def init(cls, num_members: int, in_size: int, out_size: int, *, key: PRNGKeyArray) -> "Dense":
-        """Draw truncated normal weights of std 1 / (2 sqrt(in)), zero biases (released code)."""
-        weight = truncated_normal(key, (num_members, in_size, out_size), in_size)
-        return cls(weight, jnp.zeros((num_members, out_size)))
+    def init(
+        cls, num_each: tuple[int, ...], in_size: int, out_size: int, *, key: PRNGKeyArray
+    ) -> "Dense":
+        """Draw truncated normal weights of std 1 / (2 sqrt(in)), zero biases (released code).
+
+        Args:
+            num_each: Members, or members and heads.
+            in_size: Inputs.
+            out_size: Outputs.
+            key: Draws the weights.
+        """
+        weight = truncated_normal(key, (*num_each, in_size, out_size), in_size)
+        return cls(weight, jnp.zeros((*num_each, out_size)))
 
     def __call__(self, x: Float[Array, "member batch in"]) -> Float[Array, "member batch out"]:
         """Apply each member's layer to its own inputs."""
@@ -152,28 +114,8 @@ class Dense(eqx.Module):
         return affine(x, self.weight, self.bias, self.precision)
 
 
-class DenseHeads(eqx.Module):
-    """One linear layer for every member and head, over shared inputs."""
-
-    weight: Float[Array, "member head in out"]
-    bias: Float[Array, "member head out"]
-    precision: Precision = eqx.field(static=True, default="float32")
-
-    @classmethod
-    def init(
-        cls, num_members: int, num_heads: int, in_size: int, out_size: int, *, key: PRNGKeyArray
-    ) -> "DenseHeads":
-        """As `Dense.init`, with a head axis."""
-        weight = truncated_normal(key, (num_members, num_heads, in_size, out_size), in_size)
-        return cls(weight, jnp.zeros((num_members, num_heads, out_size)))
-
-    def __call__(self, x: Float[Array, "member batch in"]) -> Float[Array, "member head batch out"]:
-        """Apply every head to its member's inputs, in one product."""
-        return columns_of_each((self,), x.mT)[0].mT
-
-
-def columns_of_each(
-    layers: Sequence[DenseHeads], x: Float[Array, "member in batch"]
+def heads_columns(
+    layers: Sequence[Dense], x: Float[Array, "member in batch"]
 ) -> list[Float[Array, "member head out batch"]]:
     """Apply layers with as many heads, and of one precision, to the same inputs in one product."""
     members, heads, in_size, out_size = layers[0].weight.shape
@@ -215,21 +157,19 @@ def softplus(x: Float[Array, "..."]) -> Float[Array, "..."]:
 class Prediction(NamedTuple):
     """Gaussian over the normalised `delta`; `logvar` is None in deterministic mode."""
 
-    mean: Float[Array, "*batch obs"]
-    logvar: Float[Array, "*batch obs"] | None
-
-    @property
-    def mT(self) -> "Prediction":  # noqa: N802, as arrays call it
-        """The same with the last two axes exchanged."""
-        return Prediction(self.mean.mT, None if self.logvar is None else self.logvar.mT)
+    mean: Float[Array, "member head obs batch"]
+    logvar: Float[Array, "member head obs batch"] | None
 
 
 class GaussianNet(eqx.Module):
-    """Backbone and prediction heads of every member; the context joins on the way."""
+    """Backbone and prediction heads of every member; the context joins on the way.
+
+    All its methods take and give features before samples.
+    """
 
     hidden: tuple[Dense, ...]
-    mean_heads: DenseHeads
-    logvar_heads: DenseHeads | None
+    mean_heads: Dense
+    logvar_heads: Dense | None
     max_logvar: Float[Array, "head obs"] | None
     min_logvar: Float[Array, "head obs"] | None
     context_layer: int | None = eqx.field(static=True, default=None)
@@ -251,56 +191,41 @@ class GaussianNet(eqx.Module):
             config: Settings of the model.
             task: The sizes of observations and actions.
             context_size: Width of the context.
-            deterministic: Whether heads predict a mean only.
+            deterministic: Heads predict a mean only.
             key: Draws the weights.
         """
         members, heads = config.num_members, config.num_heads
-        *hidden_keys, mean_key, logvar_key = jax.random.split(key, len(config.hidden_sizes) + 2)
         outs = config.hidden_sizes
         ins = [task.feature_size + task.action_size, *outs]
-        ins[{"input": 0, "last-hidden": -2, "head": -1}[config.context_at]] += context_size
+        place = {"input": 0, "last-hidden": len(outs) - 1, "head": None}[config.context_at]
+        ins[-1 if place is None else place] += context_size
+        *hidden_keys, mean_key, logvar_key = jax.random.split(key, len(outs) + 2)
         hidden = tuple(
-            Dense.init(members, n, m, key=k)
+            Dense.init((members,), n, m, key=k)
             for n, m, k in zip(ins[:-1], outs, hidden_keys, strict=True)
         )
-        mean_heads = DenseHeads.init(members, heads, ins[-1], task.obs_size, key=mean_key)
-        place = context_layer(config)
+        mean_heads = Dense.init((members, heads), ins[-1], task.obs_size, key=mean_key)
         if deterministic:
             return cls(hidden, mean_heads, None, None, None, place)
-        logvar_heads = DenseHeads.init(members, heads, ins[-1], task.obs_size, key=logvar_key)
-        shape = (heads, task.obs_size)
-        bounds = jnp.full(shape, 0.5, jnp.float32), jnp.full(shape, -10.0, jnp.float32)
-        return cls(hidden, mean_heads, logvar_heads, *bounds, place)
+        logvar_heads = Dense.init((members, heads), ins[-1], task.obs_size, key=logvar_key)
+        high, low = (jnp.full((heads, task.obs_size), b, jnp.float32) for b in (0.5, -10.0))
+        return cls(hidden, mean_heads, logvar_heads, high, low, place)
 
     def __call__(
-        self,
-        x: Float[Array, "member batch in"],
-        context: Float[Array, "member batch context"] | None,
-    ) -> Prediction:
-        """Predict with every head; results are [member, head, batch, obs]."""
-        return self.columns(x.mT, None if context is None else context.mT).mT
-
-    def columns(
         self,
         x: Float[Array, "member in batch"],
         context: Float[Array, "member context batch"] | None,
     ) -> Prediction:
-        """The same with features before samples; results are [member, head, obs, batch]."""
-        return self._predict(self._head_input(x, context))
+        """Predict with every head."""
+        return self.predict(self.head_input(x, context))
 
     def head_input(
         self,
-        x: Float[Array, "member batch in"],
-        context: Float[Array, "member batch context"] | None,
-    ) -> Float[Array, "member batch hidden"]:
+        x: Float[Array, "member in batch"],
+        context: Float[Array, "member context batch"] | None,
+    ) -> Float[Array, "member hidden batch"]:
         """Run the shared hidden layers; where the context joins the heads, it is appended."""
-        return self._head_input(x.mT, None if context is None else context.mT).mT
 
-    def predict(self, x: Float[Array, "member batch hidden"]) -> Prediction:
-        """Run the heads; results are [member, head, batch, obs]."""
-        return self._predict(x.mT).mT
-
-    def _head_input(self, x, context):
         def joined(x):
             return x if context is None else jnp.concatenate([x, context], axis=1)
 
@@ -309,18 +234,13 @@ class GaussianNet(eqx.Module):
             x = swish(layer.columns(joined(x) if index == self.context_layer else x))
         return joined(x) if self.context_layer is None else x
 
-    def _predict(self, x):
+    def predict(self, x: Float[Array, "member hidden batch"]) -> Prediction:
+        """Run the heads."""
         if self.logvar_heads is None:
-            return Prediction(columns_of_each((self.mean_heads,), x)[0], None)
-        mean, logvar = columns_of_each((self.mean_heads, self.logvar_heads), x)
+            return Prediction(heads_columns((self.mean_heads,), x)[0], None)
+        mean, logvar = heads_columns((self.mean_heads, self.logvar_heads), x)
         low, high = self.min_logvar[:, :, None], self.max_logvar[:, :, None]
         return Prediction(mean, bound_logvar(logvar, low, high))
-
-
-def context_layer(config: ModelConfig) -> int | None:
-    """Index of the hidden layer that takes the context beside its input; None if the heads do."""
-    last = len(config.hidden_sizes) - 1
-    return {"input": 0, "last-hidden": last, "head": None}[config.context_at]
 
 
 class ContextEncoder(eqx.Module):
@@ -335,7 +255,7 @@ class ContextEncoder(eqx.Module):
         sizes = (in_size, *config.context_hidden_sizes, config.context_size)
         keys = jax.random.split(key, len(sizes) - 1)
         *hidden, output = (
-            Dense.init(config.num_members, n, m, key=k)
+            Dense.init((config.num_members,), n, m, key=k)
             for n, m, k in zip(sizes[:-1], sizes[1:], keys, strict=True)
         )
         return cls(tuple(hidden), output)

@@ -9,15 +9,16 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.config import ModelConfig, Precision
+from headway.data import where_env
 from headway.models.base import Dynamics, Keys, Layer, Model, Transition, plan_layers
 from headway.models.compilation import jit_networks
 from headway.models.fitting import EpochStats, FitData, FitSetup, FitState, run_updates
-from headway.models.grbal import Window, glorot, next_obs, wide_input
-from headway.models.multi_headed import Statistics, network_input
+from headway.models.grbal import Window, glorot, next_obs, wide_input, window
 from headway.models.networks import Dense
+from headway.models.statistics import Statistics, network_input
 from headway.task import Task
 
 FORGET_BIAS = 1.0
@@ -152,23 +153,13 @@ def recurrent_epoch(
     def update(i, state):
         chosen = jax.lax.dynamic_slice_in_dim(order, i * size, size)
         counted = i * size + jnp.arange(size) < episodes.count
-        batch = whole_episodes(setup.task, data, chosen, counted)
+        batch = window(setup.task, data, chosen, jnp.zeros_like(chosen), length)
+        batch = batch._replace(weight=batch.weight * counted[:, None])
         loss, grads = batch_gradient(state.model, batch, steps)
         state, skipped = state.step(loss, grads, config.learning_rate)
         return state, loss, loss, skipped
 
     return run_updates(state, -(-episodes.count // size), update)
-
-
-def whole_episodes(
-    task: Task, data: FitData, chosen: Int[Array, " episode"], counted: Bool[Array, " episode"]
-) -> Window:
-    """Some episodes from their first step; padding, and episodes not counted, weigh 0."""
-    episodes = data.episodes
-    obs, action = episodes.obs[chosen], episodes.action[chosen]
-    valid = jnp.arange(action.shape[1]) < episodes.length[chosen][:, None]
-    weight = (valid & counted[:, None]).astype(jnp.float32)
-    return Window.of(task, data.statistics, (obs[:, :-1], action, obs[:, 1:]), weight)
 
 
 class ReBAL(Model):
@@ -180,18 +171,15 @@ class ReBAL(Model):
 
     def init_belief(self, num_envs: int, sim_params: None = None) -> tuple[CellState, ...]:
         """See `Model.init_belief`."""
-        del sim_params
         return self.net.start(num_envs)
 
     def observe(
         self, belief: tuple[CellState, ...], transition: Transition, keys: Keys
     ) -> tuple[CellState, ...]:
         """See `Model.observe`; the state goes on by the action that was taken."""
-        del keys
         x = network_input(self.task, self.statistics, transition.obs, transition.action)
         after, _ = self.net(belief, x)
-        happened = transition.happened[:, None]
-        return jax.tree.map(lambda new, old: jnp.where(happened, new, old), after, belief)
+        return where_env(transition.happened, after, belief)
 
     def dynamics(
         self, belief: tuple[CellState, ...], precision: Precision = "float32"
@@ -209,18 +197,12 @@ class RecurrentDynamics(Dynamics):
     statistics: Statistics
     task: Task
 
-    @property
-    def widest(self) -> int:
-        """See `Dynamics.widest`."""
-        return max(layer.bias.shape[-1] for layer in self.layers)
-
     def start(self) -> tuple[CellState, ...]:
         """See `Dynamics.start`."""
         return jax.tree.map(lambda x: x[None], self.own)
 
     def step(self, carry, obs, action, noise):
         """See `Dynamics.step`."""
-        del noise
         x = wide_input(self.task, self.statistics, obs, action)
         *layers, output = self.layers
         states = []

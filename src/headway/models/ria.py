@@ -8,28 +8,19 @@ same, and what it learns shapes the context encoder.
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from headway.config import FittingConfig
 from headway.models.losses import HIDDEN_DECAY, Batch, sum_of_squares, weight_decay_loss
-from headway.models.multi_headed import (
-    MultiHeadDynamics,
-    Statistics,
-    flat_history,
-    network_input,
-)
+from headway.models.multi_headed import MultiHeadNet
 from headway.models.networks import ContextEncoder, Dense, GaussianNet, swish
+from headway.models.statistics import Statistics, flat_history, network_input
 from headway.task import Task
 
-
-class RelationParts(eqx.Module):
-    """Weights that the relation loss trains."""
-
-    encoder: ContextEncoder
-    head: Dense
+RelationParts = tuple[ContextEncoder, Dense]
+"""The context encoder and the relation head, which the relation loss trains."""
 
 
 class Pairs(NamedTuple):
@@ -139,13 +130,13 @@ def relation_loss(
 
 def relation_decay_loss(parts: RelationParts) -> Float[Array, ""]:
     """Weight decay of the encoder, averaged over its layers, and of the relation head."""
-    num_layers = len(parts.encoder.hidden) + 1
-    head = 0.5 * HIDDEN_DECAY[0] * sum_of_squares(parts.head.weight)
-    return weight_decay_loss(parts.encoder) / num_layers + head
+    encoder, head = parts
+    of_head = 0.5 * HIDDEN_DECAY[0] * sum_of_squares(head.weight)
+    return weight_decay_loss(encoder) / (len(encoder.hidden) + 1) + of_head
 
 
 def intervene(
-    model: MultiHeadDynamics,
+    model: MultiHeadNet,
     task: Task,
     statistics: Statistics,
     batch: Batch,
@@ -158,7 +149,8 @@ def intervene(
         members, and how similar all contexts are by what they predict.
     """
     pairs = Pairs.of(batch)
-    context = relation_parts(model).encoder(flat_history(batch.history, statistics))
+    encoder, _ = relation_parts(model)
+    context = encoder(flat_history(batch.history, statistics))
     first = slice(config.relation_transitions or None)
 
     def distance(net: GaussianNet, obs: Array) -> Float[Array, "member sample sample"]:
@@ -174,7 +166,7 @@ def intervene(
 
 
 def relation_gradient(
-    model: MultiHeadDynamics,
+    model: MultiHeadNet,
     statistics: Statistics,
     batch: Batch,
     similar: Float[Array, "member sample sample"],
@@ -191,22 +183,16 @@ def relation_gradient(
     """
 
     def objective(parts: RelationParts) -> Float[Array, ""]:
-        context = parts.encoder(flat_history(batch.history, statistics))
-        loss = relation_loss(parts.head, context, similar, Pairs.of(batch))
+        encoder, head = parts
+        context = encoder(flat_history(batch.history, statistics))
+        loss = relation_loss(head, context, similar, Pairs.of(batch))
         return loss + decay * relation_decay_loss(parts)
 
     return jax.value_and_grad(objective)(relation_parts(model))
 
 
-def relation_parts(model: MultiHeadDynamics) -> RelationParts:
+def relation_parts(model: MultiHeadNet) -> RelationParts:
     """Weights that the relation loss trains, of a model that has a relation head."""
     assert model.context_encoder is not None
     assert model.relation_head is not None
-    return RelationParts(model.context_encoder, model.relation_head)
-
-
-def add_parts(model: MultiHeadDynamics, changes: Any) -> MultiHeadDynamics:
-    """Add changes, laid out as `RelationParts`, to what the relation loss teaches."""
-    parts = eqx.apply_updates(relation_parts(model), changes)
-    where = lambda model: (model.context_encoder, model.relation_head)  # noqa: E731
-    return eqx.tree_at(where, model, (parts.encoder, parts.head))
+    return model.context_encoder, model.relation_head

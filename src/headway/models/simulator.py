@@ -37,18 +37,15 @@ class ClassicSimulator(Model):
 
     def init_belief(self, num_envs: int, sim_params: None = None) -> Physics:
         """See `Model.init_belief`."""
-        del num_envs, sim_params
         return self._now()
 
     def observe(self, belief: Physics, transition: Transition, keys: Keys) -> Physics:
         """See `Model.observe`: look at the environments, which move; so it is no pure function."""
-        del transition, keys
         like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), belief)
         return io_callback(self._now, like, ordered=True)
 
     def dynamics(self, belief: Physics, precision: Precision = "float32") -> "ClassicDynamics":
         """See `Model.dynamics`."""
-        del precision
         return ClassicDynamics(belief, self.task, self.vector.world)
 
     def _now(self) -> Physics:
@@ -76,7 +73,6 @@ class ClassicDynamics(Dynamics):
 
     def step(self, carry, obs, action, noise):
         """See `Dynamics.step`."""
-        del obs, noise
 
         def advance(state, scaled):
             force = self.task.clip_action(self.task.scale_action(scaled))
@@ -94,19 +90,8 @@ class RobotSimulator(Model):
     task: Task
     traceable = False
 
-    def init_belief(self, num_envs: int, sim_params: None = None) -> tuple[()]:
-        """Nothing: the robots' state is MuJoCo's."""
-        del num_envs, sim_params
-        return ()
-
-    def observe(self, belief: tuple[()], transition: Transition, keys: Keys) -> tuple[()]:
-        """Nothing."""
-        del transition, keys
-        return belief
-
     def dynamics(self, belief: tuple[()], precision: Precision = "float32") -> "RobotSimulator":
         """Itself."""
-        del belief, precision
         return self
 
     def returns(

@@ -13,9 +13,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from headway.config import PlannerConfig
 from headway.data import sim_params_row
 from headway.models.base import Model, Transition
-from headway.models.compilation import in_each_precision
+from headway.models.compilation import in_each_precision, jit_networks
 from headway.planning import cpu
-from headway.planning.optimizers import Optimizer, Search, make_optimizer
+from headway.planning.optimizers import Optimizer, make_optimizer
 from headway.planning.rollouts import candidate_returns
 from headway.task import Task
 
@@ -49,6 +49,19 @@ class Decision(NamedTuple):
     """Candidates whose return was imagined, each with `num_particles` rollouts."""
 
 
+class Plan(NamedTuple):
+    """A step under way: all that is known before its search, and the search so far."""
+
+    belief: Any
+    dynamics: Any
+    obs: Float[Array, "env obs"]
+    search: Any
+    key: PRNGKeyArray
+    """Of the search."""
+    next_key: PRNGKeyArray
+    """Of the next step."""
+
+
 class Agent(eqx.Module):
     """Plans for many environments at once, each with its own physics.
 
@@ -60,6 +73,11 @@ class Agent(eqx.Module):
     """None acts at random."""
     task: Task
     planner: PlannerConfig = eqx.field(static=True)
+
+    @property
+    def optimizer(self) -> Optimizer:
+        """The search for the best action sequence."""
+        return make_optimizer(self.planner)
 
     @property
     def sim_param_names(self) -> tuple[str, ...]:
@@ -91,8 +109,7 @@ class Agent(eqx.Module):
             told = jnp.broadcast_to(np.stack(rows), (num_envs, len(names)))
         if self.model is not None:
             belief = self.model.init_belief(num_envs, told)
-            optimizer = make_optimizer(self.planner)
-            search = optimizer.init(num_envs, self.planner.horizon, action_size)
+            search = self.optimizer.init(num_envs, self.planner.horizon, action_size)
         obs = jnp.zeros((num_envs, self.task.obs_size))
         action = jnp.zeros((num_envs, action_size))
         return AgentState(belief, obs, action, jnp.zeros(num_envs, bool), search, key)
@@ -109,93 +126,107 @@ class Agent(eqx.Module):
             return state._replace(action=action, key=key), Decision(action, None, none, none)
         # Threads know nothing of a step that is part of another program (jit, vmap).
         traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((state, obs)))
-        if traced or (self.model.traceable and _shards(self, len(obs)) == 1):
-            return _act[self.planner.precision](self, state, obs)
-        step, search = begin(self, state, obs)
+        if traced or (self.model.traceable and self._num_shards(len(obs)) == 1):
+            return _step[self.planner.precision](self, state, obs)
+        plan = self.begin(state, obs)
         for iteration in range(self.planner.num_iterations):
-            search = iterate(self, step, search, iteration)
-        return end(self, step, search)
+            plan = self.iterate(plan, iteration)
+        return self.end(plan)
+
+    # The same step in several programs: a search can be cut off by a deadline, the cores of a CPU
+    # can share its candidates, and a simulator that JAX cannot trace can score them.
+
+    def begin(self, state: AgentState, obs: Float[Array, "env obs"]) -> Plan:
+        """All of a step that comes before its first iteration."""
+        return _observe[self.planner.precision](self, state, obs)
+
+    def iterate(self, plan: Plan, iteration: int) -> Plan:
+        """The plan after another iteration: ask for candidates, score them, tell their returns."""
+        assert self.model is not None
+        optimizer, precision = self.optimizer, self.planner.precision
+        # Iterations of a kind are one program; which of them it is decides the key alone.
+        which = plan.key, np.int32(iteration), iteration * optimizer.unrolled
+        candidates, key = _ask(optimizer, plan.search, *which)
+        total, shards = candidates.shape[1], self._num_shards(len(plan.obs))
+
+        def returns_of(shard: cpu.Shard | None) -> Float[Array, "env shard"]:
+            args = plan.dynamics, self.task, plan.obs, candidates
+            return _score[precision](*args, planner=self.planner, key=key, shard=shard)
+
+        if self.model.traceable:
+            returns = cpu.in_shards(returns_of, total, shards)
+        else:
+            returns = [jnp.asarray(plan.dynamics.returns(candidates))]
+        return plan._replace(search=_tell(optimizer, plan.search, candidates, returns))
+
+    def end(self, plan: Plan) -> tuple[AgentState, Decision]:
+        """The decision, by the search as it is now."""
+        return _decide(self, plan)
+
+    def _num_shards(self, num_envs: int) -> int:
+        planner = self.planner
+        per_env = planner.num_candidates * planner.num_particles * planner.horizon
+        return cpu.num_shards(num_envs * per_env)
 
 
-class Step(NamedTuple):
-    """All that is known in a step before its search."""
-
-    belief: Any
-    dynamics: Any
-    obs: Float[Array, "env obs"]
-    plan_key: PRNGKeyArray
-    next_key: PRNGKeyArray
-
-
-def observe(agent: Agent, state: AgentState, obs: Float[Array, "env obs"]) -> Step:
+def observe(agent: Agent, state: AgentState, obs: Float[Array, "env obs"]) -> Plan:
     """Let the model observe what the last action caused, and specialise it to its belief."""
     assert agent.model is not None
     keys = jax.random.split(state.key, 4)
     seen = Transition(state.obs, state.action, obs, state.acted)
     belief = agent.model.observe(state.belief, seen, keys[1:3])
     dynamics = agent.model.dynamics(belief, agent.planner.precision)
-    return Step(belief, dynamics, obs, plan_key=keys[3], next_key=keys[0])
+    return Plan(belief, dynamics, obs, state.search, key=keys[3], next_key=keys[0])
 
 
-def decide(agent: Agent, step: Step, plan: Search) -> tuple[AgentState, Decision]:
+def decide(agent: Agent, plan: Plan) -> tuple[AgentState, Decision]:
     """Take a plan's first action; where its search ended, one step later, is the next start."""
-    action, acted = plan.actions[:, 0], jnp.ones(len(step.obs), bool)
-    search = make_optimizer(agent.planner).shift(plan)
-    state = AgentState(step.belief, step.obs, action, acted, search, step.next_key)
-    heads = getattr(step.belief, "heads", None)
-    return state, Decision(action, heads, plan.non_finite, plan.evaluations)
+    search, acted = plan.search, jnp.ones(len(plan.obs), bool)
+    action, start = search.actions[:, 0], agent.optimizer.shift(search)
+    state = AgentState(plan.belief, plan.obs, action, acted, start, plan.next_key)
+    heads = getattr(plan.belief, "heads", None)
+    return state, Decision(action, heads, search.non_finite, search.evaluations)
 
 
-def act(
+def step(
     agent: Agent, state: AgentState, obs: Float[Array, "env obs"]
 ) -> tuple[AgentState, Decision]:
     """A whole step as one program: observe, specialise, search, decide."""
-    step = observe(agent, state, obs)
+    plan = observe(agent, state, obs)
 
     def score(candidates, key):
-        args = step.dynamics, agent.task, obs, candidates
+        args = plan.dynamics, agent.task, obs, candidates
         return candidate_returns(*args, planner=agent.planner, key=key)
 
-    optimizer = make_optimizer(agent.planner)
-    return decide(agent, step, optimizer.optimize(score, state.search, key=step.plan_key))
+    search = agent.optimizer.optimize(score, plan.search, key=plan.key)
+    return decide(agent, plan._replace(search=search))
 
 
-# The same step, iteration by iteration: a search can be cut off by a deadline, the cores of a CPU
-# can share its candidates, and a simulator that JAX cannot trace can score them.
+_step, _observe, _score = map(in_each_precision, (step, observe, candidate_returns))
+_decide = jit_networks(decide)
 
 
-def begin(agent: Agent, state: AgentState, obs: Float[Array, "env obs"]) -> tuple[Step, Any]:
-    """All of a step that comes before its first iteration, and the search as it is then."""
-    return _begin[agent.planner.precision](agent, state, obs)
+@jit_networks
+def _ask(
+    optimizer: Optimizer, search: Any, plan_key: PRNGKeyArray, iteration: Int[Any, ""], kind: int
+) -> tuple[Float[Array, "env candidate horizon action"], PRNGKeyArray]:
+    """Candidates, and the key that scores them; keys as in `Optimizer.optimize`."""
+    key = jax.random.split(plan_key, optimizer.num_iterations)[iteration]
+    ask_key, score_key = jax.random.split(key)
+    return optimizer.ask(search, ask_key, kind), score_key
 
 
-def iterate(agent: Agent, step: Step, search: Any, iteration: int) -> Any:
-    """The search after another iteration: ask for candidates, score them, tell their returns."""
-    assert agent.model is not None
-    planner, optimizer = agent.planner, make_optimizer(agent.planner)
-    shards = _shards(agent, len(step.obs))
-    # Iterations of a kind are one program; which of them it is decides the key alone.
-    which = step.plan_key, np.int32(iteration), iteration * optimizer.unrolled
-    if agent.model.traceable and shards == 1:
-        return _iterate[planner.precision](agent, step, search, *which)
-    candidates, score_key = _ask[planner.precision](optimizer, search, *which)
-
-    def returns_of(shard: cpu.Shard) -> Float[Array, "env shard"]:
-        args = step.dynamics, agent.task, step.obs, candidates
-        return _score[planner.precision](*args, planner=planner, key=score_key, shard=shard)
-
-    if agent.model.traceable:
-        returns = cpu.in_shards(returns_of, candidates.shape[1], shards)
-    else:
-        returns = [jnp.asarray(step.dynamics.returns(candidates))]
-    return _tell[planner.precision](optimizer, search, candidates, returns)
+@jit_networks
+def _tell(
+    optimizer: Optimizer,
+    search: Any,
+    candidates: Float[Array, "env candidate horizon action"],
+    returns: list[Float[Array, "env shard"]],
+) -> Any:
+    return optimizer.tell(search, candidates, cpu.joined(returns, candidates.shape[1]))
 
 
-def end(agent: Agent, step: Step, search: Any) -> tuple[AgentState, Decision]:
-    """The decision, by the search as it is now."""
-    return _end[agent.planner.precision](agent, step, search)
-
-
+@eqx.filter_jit
 def open_loop(planner: PlannerConfig, state: AgentState) -> AgentState:
     """Go on along the last plan without a look: its next action is the state's `action`.
 
@@ -209,44 +240,3 @@ def open_loop(planner: PlannerConfig, state: AgentState) -> AgentState:
     search = make_optimizer(planner).shift(state.search)
     unseen = jnp.zeros_like(state.acted)
     return state._replace(action=state.search.nominal[:, 0], acted=unseen, search=search)
-
-
-def _shards(agent: Agent, num_envs: int) -> int:
-    planner = agent.planner
-    per_env = planner.num_candidates * planner.num_particles * planner.horizon
-    return cpu.num_shards(num_envs * per_env)
-
-
-def _begun(agent: Agent, state: AgentState, obs: Float[Array, "env obs"]) -> tuple[Step, Any]:
-    return observe(agent, state, obs), state.search
-
-
-def _asked(
-    optimizer: Optimizer, search: Any, plan_key: PRNGKeyArray, iteration: Int[Any, ""], kind: int
-) -> tuple[Float[Array, "env candidate horizon action"], PRNGKeyArray]:
-    """Candidates, and the key that scores them; keys as in `Optimizer.optimize`."""
-    key = jax.random.split(plan_key, optimizer.num_iterations)[iteration]
-    ask_key, score_key = jax.random.split(key)
-    return optimizer.ask(search, ask_key, kind), score_key
-
-
-def _told(
-    optimizer: Optimizer,
-    search: Any,
-    candidates: Float[Array, "env candidate horizon action"],
-    returns: list[Float[Array, "env shard"]],
-) -> Any:
-    return optimizer.tell(search, candidates, cpu.joined(returns, candidates.shape[1]))
-
-
-def _iterated(agent: Agent, step: Step, search: Any, *which: Any) -> Any:
-    optimizer = make_optimizer(agent.planner)
-    candidates, key = _asked(optimizer, search, *which)
-    args = step.dynamics, agent.task, step.obs, candidates
-    returns = candidate_returns(*args, planner=agent.planner, key=key)
-    return optimizer.tell(search, candidates, returns)
-
-
-_act, _begin, _iterate, _ask, _tell, _end, _score = map(
-    in_each_precision, (act, _begun, _iterated, _asked, _told, decide, candidate_returns)
-)

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from headway.errors import ConfigError, PlanningError, shown
-from headway.planning.agent import Agent, Decision, begin, end, iterate, open_loop
+from headway.planning.agent import Agent, Decision, open_loop
 from headway.task import env_action, scaled_action
 
 REMEMBERED = 32
@@ -22,8 +22,6 @@ CONSTANT = 0.01
 """Distance from its only value in training that a feature may have, relative to it or to 1."""
 MARGIN = 0.1
 """Distance from its bounds that an action which was measured may have, relative to theirs."""
-
-_open_loop: Callable[..., Any] = eqx.filter_jit(open_loop)
 
 
 class Status(NamedTuple):
@@ -79,13 +77,10 @@ class Controller:
     ):
         self.agent = agent
         self._seed, self._clock, self._episode = seed, clock, -1
-        statistics = getattr(agent.model, "statistics", None)
-        self._features = (
-            None if max_deviations is None or statistics is None else statistics.features
-        )
-        self._max_deviations = max_deviations or 0.0
+        self._statistics = getattr(agent.model, "statistics", None)
+        self._max_deviations = max_deviations
         self._preprocess = eqx.filter_jit(agent.task.preprocess)
-        self._durations = {name: deque([0.0], REMEMBERED) for name in ("iterate", "end")}
+        self._durations = {name: deque(maxlen=REMEMBERED) for name in ("iterate", "end")}
         self._seconds = None if deadline_ms is None else deadline_ms / 1000
         if deadline_ms is not None:
             if not 0 < deadline_ms < float("inf"):
@@ -212,23 +207,22 @@ class Controller:
             return decision, self._num_iterations
         until, done = started + self._seconds, 0
         at_least = 0 if self._left > 0 else 1  # without a plan there is nothing else to do
-        step, search = begin(self.agent, self._state, jnp.asarray(obs[None]))
+        plan = self.agent.begin(self._state, jnp.asarray(obs[None]))
         while done < self._num_iterations:
-            slowest = sum(map(max, self._durations.values()))
+            slowest = sum(max(durations, default=0.0) for durations in self._durations.values())
             if done >= at_least and self._clock() + slowest > until:
                 break
-            search = self._timed("iterate", iterate, step, search, done)
+            plan = self._timed("iterate", plan, done)
             done += 1
         if done == 0:  # one hiccup is not remembered for long
-            for durations in self._durations.values():
+            for durations in filter(None, self._durations.values()):
                 durations.remove(max(durations))
-                durations.extend([] if durations else [0.0])
-        self._state, decision = self._timed("end", end, step, search)
+        self._state, decision = self._timed("end", plan)
         return decision, done
 
-    def _timed(self, name: str, part: Callable, *args: Any) -> Any:
+    def _timed(self, name: str, *args: Any) -> Any:
         started = self._clock()
-        found = jax.block_until_ready(part(self.agent, *args))
+        found = jax.block_until_ready(getattr(self.agent, name)(*args))
         self._durations[name].append(self._clock() - started)
         return found
 
@@ -246,12 +240,11 @@ class Controller:
         for _ in range(3):
             for durations in self._durations.values():
                 durations.clear()  # the first times are those of compiling
-                durations.append(0.0)
             self._search(obs, in_time)
 
     def _hold(self) -> Float[np.ndarray, " action"]:
         """The next action of the last plan, without a look (open loop)."""
-        self._state = _open_loop(self.agent.planner, self._state)
+        self._state = open_loop(self.agent.planner, self._state)
         return env_action(self.agent.task, jax.device_get(self._state.action)[0])
 
     def _count_left(self, *, held: bool, reason: str) -> None:
@@ -299,9 +292,10 @@ class Controller:
         Mean and spread are all that is kept of the training data. A feature is what
         `Task.preprocess` makes of an observation, mostly an entry of it.
         """
-        if self._features is None:
+        if self._max_deviations is None or self._statistics is None:
             return ()
-        mean, std = np.asarray(self._features.mean), np.asarray(self._features.std)
+        features = self._statistics.features
+        mean, std = np.asarray(features.mean), np.asarray(features.std)
         off = np.abs(jax.device_get(self._preprocess(jnp.asarray(obs))) - mean)
         constant = CONSTANT * np.maximum(np.abs(mean), 1.0)
         allowed = np.where(std == 0, constant, self._max_deviations * std)

@@ -49,17 +49,19 @@ def num_shards(num_steps: int) -> int:
 
 
 def in_shards(
-    returns_of: Callable[[Shard], Float[Array, "env shard"]], total: int, shards: int
+    returns_of: Callable[[Shard | None], Float[Array, "env shard"]], total: int, shards: int
 ) -> list[Float[Array, "env shard"]]:
     """Compute returns in shards of one size, side by side; `joined` puts them together.
 
     JAX's settings that a context manager makes for this thread do not reach the others.
 
     Args:
-        returns_of: Compiled: the returns of some candidates.
+        returns_of: Compiled: the returns of some candidates, or of all for None.
         total: Number of all candidates.
         shards: Number of shards, at most.
     """
+    if shards == 1:
+        return [returns_of(None)]
     size = -(-total // shards)
 
     def of_shard(first: int) -> Array:

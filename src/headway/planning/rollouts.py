@@ -1,15 +1,17 @@
 """Imagined rollouts: candidate action sequences in, returns out (released `core/utils.py`)."""
 
 import functools
+import itertools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from headway.config import PlannerConfig
+from headway.config import ModelConfig, PlannerConfig
 from headway.models.base import Dynamics, over_rows
 from headway.planning import cpu
+from headway.planning.optimizers import make_optimizer
 from headway.task import Task
 
 
@@ -140,3 +142,31 @@ def follow(
         return jax.lax.scan(step, (state, alone(obs)), actions)[1]
 
     return jax.vmap(of_env)(dynamics.own, obs, actions).transpose(2, 0, 1, 3)
+
+
+def plan_flop(
+    model: ModelConfig, planner: PlannerConfig, task: Task, evaluations: float | None = None
+) -> float:
+    """Floating-point operations of the matrix products of one environment's plan.
+
+    The imagined rollouts are counted. Left out is what happens once per step, encoding the
+    context, learning and choosing a head: less than a thousandth at the paper's sizes.
+
+    Args:
+        model: Settings of the networks.
+        planner: Settings of the planner.
+        task: The sizes of observations and actions.
+        evaluations: Candidates that were scored; by default as many as the search may score.
+    """
+    if not model.learns:
+        return 0.0
+    # Averaged mean heads are folded into one; their variances are not.
+    variances = model.num_heads if planner.head_selection == "average" else 1
+    outputs = 1 + (0 if model.deterministic else variances)
+    sizes = (task.feature_size + task.action_size, *model.hidden_sizes)
+    recurrent = model.kind == "recurrent"  # four gates per unit
+    products = sum(4 * (n + m) * m if recurrent else n * m for n, m in itertools.pairwise(sizes))
+    per_step = 2.0 * (products + sizes[-1] * outputs * task.obs_size)
+    if evaluations is None:
+        evaluations = make_optimizer(planner).max_evaluations
+    return evaluations * planner.num_particles * planner.horizon * per_step

@@ -16,7 +16,7 @@ from headway.data import Trajectory
 from headway.errors import unknown_name
 from headway.models.compilation import prepare_jax
 from headway.planning.agent import Agent
-from headway.planning.flop import plan_flop
+from headway.planning.rollouts import plan_flop
 from headway.sim_params import SimParamSets
 from headway.training.collect import Batches, Environments, Episode, PlannerUse, agent_policy
 from headway.training.methods import config_to_evaluate

@@ -16,8 +16,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy import stats
 
 from headway.data import Trajectory, sim_params_row
-from headway.models.acting import MultiHeadBelief, MultiHeadModel
 from headway.models.base import Transition
+from headway.models.multi_headed import MultiHeadBelief, MultiHeadModel
 
 LEVELS = (0.5, 0.9, 0.95)  # central intervals that are counted
 

@@ -24,7 +24,6 @@ from headway.config import (
 )
 from headway.data import Episodes, Samples, Trajectory
 from headway.errors import ConfigError
-from headway.models.acting import MultiHeadModel
 from headway.models.base import Model
 from headway.models.fitting import (
     EpochStats,
@@ -37,8 +36,9 @@ from headway.models.fitting import (
 )
 from headway.models.grbal import GrBAL, ReluNet, meta_epoch
 from headway.models.last_layer_prior import fit_prior
-from headway.models.multi_headed import MultiHeadDynamics, Statistics
+from headway.models.multi_headed import MultiHeadModel, MultiHeadNet
 from headway.models.rebal import ReBAL, RecurrentNet, recurrent_epoch
+from headway.models.statistics import Statistics
 from headway.planning.agent import Agent
 from headway.task import episode_length, task_of
 from headway.training.collect import Environments
@@ -204,7 +204,7 @@ class MultiHeadedTrainer(Fitted):
     def init(self, key: PRNGKeyArray) -> TrainState:
         """See `Trainer.init`."""
         model = self.config.model
-        net = MultiHeadDynamics.init(model, self.task, sim_param_names=self.names, key=key)
+        net = MultiHeadNet.init(model, self.task, sim_param_names=self.names, key=key)
         return self.begin_with(net)
 
     def epoch(self, iteration, key):

@@ -8,7 +8,6 @@ from headway.config import PlannerConfig
 from headway.planning.optimizers.base import Optimizer as Optimizer
 from headway.planning.optimizers.base import Score as Score
 from headway.planning.optimizers.base import Search as Search
-from headway.planning.optimizers.base import where_env as where_env
 from headway.planning.optimizers.cem import CEM as CEM
 from headway.planning.optimizers.icem import ICEM as ICEM
 from headway.planning.optimizers.mppi import MPPI as MPPI

@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple, TypeVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,8 +14,6 @@ Score = Callable[
     [Float[Array, "env candidate horizon action"], PRNGKeyArray], Float[Array, "env candidate"]
 ]
 """Returns of candidates, by a key; a non-finite one ranks last."""
-
-Tree = TypeVar("Tree")
 
 
 class Search(NamedTuple):
@@ -45,9 +43,9 @@ class Search(NamedTuple):
 class Optimizer(eqx.Module):
     """Searches for the action sequence of the highest return: ask for candidates, tell returns."""
 
-    num_candidates: eqx.AbstractVar[int]
-    num_iterations: eqx.AbstractVar[int]
     initial_std: eqx.AbstractVar[float]
+    num_candidates: int = 200
+    num_iterations: int = 5
     num_kept = 0
     """Elites that compete once more."""
     unrolled: ClassVar[bool] = False
@@ -127,13 +125,6 @@ def shift_steps(
     """Drop the first step and append `last`."""
     appended = jnp.broadcast_to(last, values[..., :1, :].shape)
     return jnp.concatenate([values[..., 1:, :], appended], axis=-2)
-
-
-def where_env(condition: Bool[Array, " env"], chosen: Tree, other: Tree) -> Tree:
-    """For each environment, the arrays of one tree or those of the other."""
-    return jax.tree.map(
-        lambda x, y: jnp.where(condition.reshape(-1, *[1] * (x.ndim - 1)), x, y), chosen, other
-    )
 
 
 def rank_non_finite_last(

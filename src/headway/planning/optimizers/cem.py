@@ -13,15 +13,12 @@ class CEM(Optimizer):
     finite elites of the last iteration.
     """
 
-    num_candidates: int = 200
     num_elites: int = 50
-    num_iterations: int = 5
     smoothing: float = 0.1
     initial_std: float = 0.5
 
     def ask(self, search, key, iteration=0):
         """See `Optimizer.ask`: a normal truncated at two deviations, narrowed to stay inside ±1."""
-        del iteration  # all are alike
         mean = search.nominal
         room = jnp.minimum((mean + 1) / 2, (1 - mean) / 2)
         std = jnp.minimum(jnp.abs(room), search.std)

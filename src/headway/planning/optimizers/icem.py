@@ -2,17 +2,12 @@
 
 import jax.numpy as jnp
 
-from headway.planning.optimizers.base import (
-    Optimizer,
-    best_candidates,
-    colored_noise,
-    moments,
-    shift_steps,
-    where_env,
-)
+from headway.data import where_env
+from headway.planning.optimizers.base import best_candidates, colored_noise, moments, shift_steps
+from headway.planning.optimizers.cem import CEM
 
 
-class ICEM(Optimizer):
+class ICEM(CEM):
     """Cross-entropy method with coloured noise and memory (Pinneri et al., 2020, algorithm 1).
 
     Candidates are clipped to the bounds. Fewer are drawn in each iteration. A share of the
@@ -21,11 +16,7 @@ class ICEM(Optimizer):
     too. The plan is the best elite of the last iteration, and the expected return its return.
     """
 
-    num_candidates: int = 200
     num_elites: int = 10
-    num_iterations: int = 5
-    smoothing: float = 0.1
-    initial_std: float = 0.5
     noise_beta: float = 2.0
     population_decay: float = 1.25
     kept_elite_fraction: float = 0.3

@@ -18,15 +18,12 @@ class MPPI(Optimizer):
     the mean. The expected return is the weighted mean return of the last iteration.
     """
 
-    num_candidates: int = 200
-    num_iterations: int = 5
     initial_std: float = 0.5
     noise_beta: float = 2.0
     temperature: float = 0.5
 
     def ask(self, search, key, iteration=0):
         """See `Optimizer.ask`."""
-        del iteration  # all are alike
         mean = search.nominal
         shape = len(mean), self.num_candidates, *mean.shape[1:]
         noise = colored_noise(key, shape, self.noise_beta)

@@ -12,13 +12,10 @@ class RandomShooting(Optimizer):
     The nominal plan is used only where nothing is finite; the expected return is the best one.
     """
 
-    num_candidates: int = 200
-    num_iterations: int = 5
     initial_std = 0.0
 
     def ask(self, search, key, iteration=0):
         """See `Optimizer.ask`."""
-        del iteration  # all are alike
         shape = len(search.nominal), self.num_candidates, *search.nominal.shape[1:]
         return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
 
