@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import toys
+from headway.config import CEMConfig
 from headway.models.base import FunctionModel
 from headway.models.statistics import Statistics
 from headway.planning.agent import Agent
@@ -142,16 +143,18 @@ def test_an_agent_without_a_model_acts_at_random():
 
 def test_reduced_precision_chooses_nearly_the_same_actions():
     observed = np.random.default_rng(1).normal(size=(8, 3, 2)).astype(np.float32)
+    planner = {"horizon": 5, "num_candidates": 40, "optimizer": CEMConfig(num_elites=8)}
+    planner |= {"num_iterations": 3, "num_particles": 4, "selection_length": 10}
 
     def actions(**settings):
-        agent = make_agent(toys.small_model(seed=3), **settings)
+        agent = make_agent(toys.small_model(seed=3), **planner | settings)
         state, found = start(agent, 3), []
         for obs in observed:
             state, decision = agent.act(state, obs)
             found.append(np.asarray(decision.action))
         return np.stack(found)
 
-    exact, reduced, other = actions(), actions(precision="bfloat16"), actions(num_candidates=61)
+    exact, reduced, other = actions(), actions(precision="bfloat16"), actions(num_candidates=41)
     difference = np.abs(exact - reduced)
     assert difference.any()
     assert np.median(difference) < 0.02

@@ -59,11 +59,15 @@ def transitions(count, num_envs=2, seed=0):
 
 
 @eqx.filter_jit
-def live(model, steps):
+def lived(model, steps, keys):
     belief = model.init_belief(len(steps[0].obs))
     for step in steps:
-        belief = model.observe(belief, step, KEYS)
+        belief = model.observe(belief, step, keys)
     return belief
+
+
+def live(model, steps):
+    return lived(model, steps, KEYS)
 
 
 @eqx.filter_jit
@@ -157,8 +161,8 @@ def test_an_agent_learns_from_its_steps_and_begins_every_episode_anew(model):
 
     state, actions = play()
     steps = zip(observed[:-1], actions[:-1], observed[1:], strict=True)
-    lived = live(model, [Transition(*map(jnp.asarray, step), YES) for step in steps])
-    close(state.belief, lived)
+    steps = [Transition(*map(jnp.asarray, step), YES) for step in steps]
+    close(state.belief, live(model, steps))
     np.testing.assert_array_equal(play()[1], actions)  # nothing is left of the first episode
     toys.assert_equal(agent.init(2, key=jax.random.key(0)).belief, model.init_belief(2))
 
