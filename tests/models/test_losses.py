@@ -25,6 +25,7 @@ from headway.models.losses import (
 from headway.models.networks import Prediction, bound_logvar
 
 REDUCTIONS = ["head", "segment"]
+STATISTICS = toys.odd_statistics()
 seeds = st.integers(0, 2**16)
 sizes = st.sampled_from([(2, 3, 9), (1, 2, 4)])  # few shapes, few compilations
 
@@ -110,7 +111,7 @@ def random_batch(seed, samples=6, members=2):
 @eqx.filter_jit
 def gradient(model, owners, batch, config):
     def objective(model):
-        losses = head_losses(model, toys.POINT, toys.odd_statistics(), batch)
+        losses = head_losses(model, toys.POINT, STATISTICS, batch)
         return total_loss(model, losses, owners, batch.weight, config)[0]
 
     return jax.grad(objective)(model)

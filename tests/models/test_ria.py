@@ -115,7 +115,8 @@ def test_weight_decay_averages_the_encoders_layers():
 def first_update():
     """A new model, and what its first update reads."""
     setup = toys.make_setup(batch_size=8)
-    data = toys.fit_data([toys.random_trajectory(6, seed=n) for n in range(3)], setup)
+    trajectories = [toys.random_trajectory(6, seed=n) for n in range(3)]
+    data = toys.fit_data(trajectories, setup, future_length=2)
     model = MultiHeadNet.init(RIA, toys.POINT, key=jax.random.key(0))
     order = jnp.broadcast_to(jnp.arange(8), (2, 8))
     batch, _ = gather_batch(data, None, order, jnp.ones((2, 8)), setup)
@@ -146,7 +147,7 @@ def test_nothing_is_learned_where_only_the_relation_loss_is_not_finite():
 def test_the_relation_is_learned_and_contexts_of_one_trajectory_come_together():
     trajectories = [toys.random_trajectory(12, seed=n, gain=g) for n, g in enumerate((1, -1) * 3)]
     setup = toys.make_setup(batch_size=32, learning_rate=3e-3, relation_distance_weight=20.0)
-    data = toys.fit_data(trajectories, setup)
+    data = toys.fit_data(trajectories, setup, future_length=2)
     state = FitState.new(MultiHeadNet.init(RIA, toys.POINT, key=jax.random.key(0)))
     order = jnp.asarray(np.random.default_rng(0).integers(0, int(data.samples.count), (2, 32)))
     batch, _ = gather_batch(data, None, order, jnp.ones((2, 32)), setup)
