@@ -62,7 +62,14 @@ def whole_loss(net, batch):
 def rollout(net, xs, state=None):
     """Predictions of whole sequences [episode, step, in]; the state from zero by default."""
     state = net.start(len(xs)) if state is None else state
-    return jax.lax.scan(lambda *now: net(*now), state, xs.swapaxes(0, 1))[1].swapaxes(0, 1)
+    return go_through(net, state, xs)[1].swapaxes(0, 1)
+
+
+def go_through(net, state, xs):
+    def step(state, x):
+        return net(state, x)
+
+    return jax.lax.scan(step, state, xs.swapaxes(0, 1))
 
 
 def test_an_untruncated_gradient_is_that_of_the_whole_error_whatever_the_padding():
@@ -81,7 +88,7 @@ def test_a_truncated_gradient_stops_between_chunks_but_the_state_goes_on():
 
     def second_half(net):
         """The error of the second chunk alone, from the state that the first one ends with."""
-        state, _ = jax.lax.scan(lambda *now: net(*now), net.start(2), batch.x[:, :4].swapaxes(0, 1))
+        state, _ = go_through(net, net.start(2), batch.x[:, :4])
         predicted = rollout(net, batch.x[:, 4:], jax.lax.stop_gradient(state))
         errors = jnp.square(predicted - batch.delta[:, 4:]).mean(-1)
         return (batch.weight[:, 4:] * errors).sum() / batch.weight.sum()
