@@ -53,11 +53,7 @@ class FitState(eqx.Module):
         return cls(model, adam.init(model), adam.init(parts))
 
     def step(
-        self,
-        loss: Float[Array, ""],
-        grads: Any,
-        learning_rate: float,
-        relation_grads: Any = None,
+        self, loss: Float[Array, ""], grads: Any, learning_rate: float, relation_grads: Any = None
     ) -> tuple["FitState", Bool[Array, ""]]:
         """Take one Adam step, unless the loss or the norm of the gradient is not finite.
 

@@ -172,11 +172,8 @@ def window(
     inside = (step >= 0) & (step < episodes.length[episode][:, None])
     step = jnp.clip(step, 0, episodes.action.shape[1] - 1)
     rows = episode[:, None]
-    transitions = (
-        episodes.obs[rows, step],
-        episodes.action[rows, step],
-        episodes.obs[rows, step + 1],
-    )
+    obs, action = episodes.obs[rows, step], episodes.action[rows, step]
+    transitions = obs, action, episodes.obs[rows, step + 1]
     return Window.of(task, data.statistics, transitions, inside.astype(jnp.float32))
 
 

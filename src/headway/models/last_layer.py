@@ -220,12 +220,8 @@ def robust_weight(layer: LastLayer, prior: Prior, seen: Residuals) -> Float[Arra
 
 def _student_t(
     layer: LastLayer, prior: Prior, seen: Residuals
-) -> tuple[
-    Float[Array, "env member head obs"],
-    Float[Array, "env member"],
-    Float[Array, "env member head obs"],
-]:
-    """Error, degrees of freedom and squared scale of a prediction."""
+) -> tuple[Float[Array, "env member head obs"], Float[Array, "env member"], Array]:
+    """Error, degrees of freedom and squared scale of a prediction, which is laid out as errors."""
     error, _, variance = innovate(layer, seen)
     dof = NOISE_DOF + layer.count
     noise = (NOISE_DOF * prior.noise[:, None] + layer.squares) / dof[..., None, None]

@@ -138,9 +138,7 @@ class MultiHeadNet(eqx.Module):
         self,
         task: Task,
         statistics: Statistics,
-        transition: tuple[
-            Float[Array, "env obs"], Float[Array, "env action"], Float[Array, "env obs"]
-        ],
+        transition: tuple[Array, Array, Array],
         context: Float[Array, "member env context"] | None,
     ) -> Residuals:
         """Compare one transition per environment with every head's prediction.
@@ -148,7 +146,7 @@ class MultiHeadNet(eqx.Module):
         Args:
             task: How observations enter and leave the model.
             statistics: The normalisers in use.
-            transition: Observations, actions in [-1, 1], next observations.
+            transition: Observations, actions in [-1, 1], next observations; [env, ...].
             context: The context vectors that the heads plan with.
         """
         obs, action, next_obs = transition
@@ -270,11 +268,7 @@ class MultiHeadModel(Model):
 
     def head_errors(
         self,
-        transitions: tuple[
-            Float[Array, "env slot obs"],
-            Float[Array, "env slot action"],
-            Float[Array, "env slot obs"],
-        ],
+        transitions: tuple[Array, Array, Array],
         context: Context,
         *,
         sampling_key: PRNGKeyArray | None = None,
@@ -286,7 +280,7 @@ class MultiHeadModel(Model):
         released code has it.
 
         Args:
-            transitions: Observations, actions in [-1, 1], next observations.
+            transitions: Observations, actions in [-1, 1], next observations; [env, slot, ...].
             context: Of every member and environment.
             sampling_key: Draws the samples.
         """
