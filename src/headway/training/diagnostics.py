@@ -44,7 +44,7 @@ def prediction_error(
     count = jnp.asarray([min(s, slots) for _, s in starts], jnp.int32)
     obs, action = window("obs", -slots, slots), window("action", -slots, slots)
     past = obs, action, window("obs", 1 - slots, slots)
-    recent = RecentTransitions(*map(jnp.asarray, past), count)
+    recent = RecentTransitions(*map(jnp.asarray, past), count=count)
     told, names = None, model.sim_param_names
     if names:
         told = jnp.asarray(np.stack([sim_params_row(t.sim_params, names) for t, _ in starts]))

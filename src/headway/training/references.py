@@ -16,7 +16,7 @@ from headway.errors import ConfigError
 from headway.task import env_options, env_spec, episode_length
 from headway.training.run import EpisodeRow
 
-with (importlib.resources.files(__package__) / "references.csv").open() as _file:
+with (importlib.resources.files("headway.training") / "references.csv").open() as _file:
     _ROWS = list(csv.DictReader(_file))
 _REFERENCES = {
     (row["env"], int(row["steps"]), row["sim_param"], float(row["value"])): (
