@@ -22,9 +22,8 @@ class RandomShooting(Optimizer):
     def tell(self, search, candidates, returns):
         """See `Optimizer.tell`."""
         (best,), (top,) = (x.swapaxes(0, 1) for x in best_candidates(candidates, returns, 1))
-        better = top > search.expected_return
         return search._replace(
-            nominal=jnp.where(better[:, None, None], best, search.nominal),
+            nominal=jnp.where((top > search.expected_return)[:, None, None], best, search.nominal),
             expected_return=jnp.maximum(search.expected_return, top),
             non_finite=search.non_finite + ~jnp.isfinite(top),
             evaluations=search.evaluations + self.num_candidates,
