@@ -41,8 +41,7 @@ class Run:
 
     def __repr__(self) -> str:
         """One line: directory and last test returns."""
-        config = self.config
-        name = f"{config.method} on {config.env}, seed {config.seed}"
+        name = f"{self.config.method} on {self.config.env}, seed {self.config.seed}"
         name += f", {len(self.metrics)} iterations{returns_in_words(self.last_tests)}"
         return f"Run({str(self.path)!r}: {name})"
 
