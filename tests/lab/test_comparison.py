@@ -1,11 +1,11 @@
 """Figure, raw numbers and table of an experiment, and the commands that make them."""
 
-import csv
 import dataclasses
 import re
 
 import fakes
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
 
@@ -23,11 +23,6 @@ def compare(out, name="fig13", seeds=(0,), command="", **asked):
     )
 
 
-def rows_of(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def test_files_stand_beside_each_other_and_hold_what_the_runs_say(training, tmp_path):
     done = compare(tmp_path, seeds=THREE, command="headway reproduce fig13")
     folder = tmp_path / "fig13-smoke"
@@ -35,17 +30,12 @@ def test_files_stand_beside_each_other_and_hold_what_the_runs_say(training, tmp_
         "fig13.csv", "fig13.md", "fig13.png", "fig13.svg"
     ]  # fmt: skip
     assert {path.parent for path in done.files} == {folder}
-    rows = rows_of(folder / "fig13.csv")
+    rows = pd.read_csv(folder / "fig13.csv")
     # 2 arms, 3 seeds, 2 iterations, training physics and 2 unseen groups, 2 episodes
     assert len(rows) == 2 * 3 * 2 * 3 * 2
-    unseen = [
-        float(row["return"])
-        for row in rows
-        if (row["arm"], row["seed"], row["iteration"]) == ("MCL", "2", "1")
-        and row["group"] != "train"
-    ]
-    assert np.mean(unseen) == 30 + 2 + 1  # see fakes.level
-    assert all((tmp_path / row["run"] / "config.json").exists() for row in rows)
+    unseen = rows.query("arm == 'MCL' and seed == 2 and iteration == 1 and group != 'train'")
+    assert unseen["return"].mean() == 30 + 2 + 1  # see fakes.level
+    assert all((tmp_path / run / "config.json").exists() for run in rows.run)
     text = (folder / "fig13.md").read_text()
     spread_of_three = r"32.0 \(3[1-3][.\d]* to 3[1-3][.\d]*\)"
     assert re.search(
@@ -76,8 +66,7 @@ def test_figures_have_ink_and_svg_names_the_arms(training, tmp_path):
 
 def test_training_curves_show_what_was_collected(training, tmp_path):
     done = compare(tmp_path, "fig9")
-    rows = rows_of(tmp_path / "fig9-smoke/fig9.csv")
-    assert {row["group"] for row in rows} == {"collected"}
+    assert {*pd.read_csv(tmp_path / "fig9-smoke/fig9.csv").group} == {"collected"}
     points = done.points.query("label == 'T-MCL'")
     assert list(zip(points.iteration, points["return"], strict=True)) == [(0, 40.0), (1, 41.0)]
 

@@ -15,6 +15,7 @@ from headway.lab.figures import save_run_figures
 from headway.lab.paper import Arm, experiment, sweep_experiment
 from headway.training.methods import METHODS
 
+TABLES = ["metrics.jsonl", "evaluation.csv", "assignments.csv", "prediction_error.csv"]
 ALL = ["learning_curve.png", "evaluation.png", "head_shares.png", "prediction_error.png"]
 
 
@@ -30,15 +31,7 @@ def test_every_figure_is_drawn_and_settings_of_the_user_stay(run_dir):
     assert dict(matplotlib.rcParams) == before
 
 
-@pytest.mark.parametrize(
-    ("missing", "figure"),
-    [
-        ("metrics.jsonl", "learning_curve.png"),
-        ("evaluation.csv", "evaluation.png"),
-        ("assignments.csv", "head_shares.png"),
-        ("prediction_error.csv", "prediction_error.png"),
-    ],
-)
+@pytest.mark.parametrize(("missing", "figure"), zip(TABLES, ALL, strict=True))
 def test_a_missing_file_leaves_its_figure_out(run_dir, missing, figure):
     (run_dir / missing).unlink()
     names = [path.name for path in save_run_figures(run_dir)]

@@ -1,6 +1,6 @@
 import numpy as np
 
-from headway.lab.dynamics import choose_views, collect_changes, plot_dynamics
+from headway.lab.dynamics import choose_views, collect_changes
 from headway.task import env_names, env_spec
 
 
@@ -21,11 +21,6 @@ def test_only_the_physics_differ_between_the_changes():
     same = physics.index(physics[0], 1)
     np.testing.assert_allclose(changes[same], changes[0], atol=1e-6)
     assert (np.ptp(changes[1:, :, 2], axis=0) > 0).all()
-
-
-def test_the_figure_is_written(tmp_path):
-    path = plot_dynamics("pendulum", tmp_path / "deep/a.png", num_states=5)
-    assert path.read_bytes().startswith(b"\x89PNG")
 
 
 def test_names_of_observations_fit_the_environments():
