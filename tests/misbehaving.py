@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import gymnasium
@@ -63,9 +62,6 @@ class Drift(gymnasium.Env):
             except FileExistsError:
                 return None
         return getattr(self, self.how)()
-
-    def hang(self):
-        time.sleep(1000)
 
     def hang_in_c(self):
         """No Python code can run meanwhile, as in a simulator that waits for ever."""

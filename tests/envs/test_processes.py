@@ -103,7 +103,7 @@ def test_what_is_lost_costs_its_episode_only(how, reason, made, tmp_path):
 
 
 def test_a_reset_that_hangs_is_tried_again_in_the_next_episode(made, tmp_path):
-    vector = made("hang", timeout_s=2.0, at=0, mark=str(tmp_path / "once"))
+    vector = made("hang_in_c", timeout_s=2.0, at=0, mark=str(tmp_path / "once"))
     obs, info = vector.reset(seed=0)
     assert info["broken"] == {0: "did not answer to reset within 2 s"}
     assert np.isnan(obs).any(1).tolist() == [True, False]

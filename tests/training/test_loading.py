@@ -1,6 +1,5 @@
 """Acting from a run: another planner, heads that learn, a copy that lacks files, no simulator."""
 
-import dataclasses
 import shutil
 import subprocess
 import sys
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 
 import headway
-from headway.config import CEMConfig
 from headway.errors import ConfigError, RunError
 from headway.training.methods import config_to_evaluate
 from headway.training.run import RunDir
@@ -20,34 +18,14 @@ OBS = np.array([1.0, 0.0, 0.0])
 LAST_LAYER = {"planner.adaptation": "last-layer"}
 
 
-def test_a_controller_can_have_another_planner(root):
-    settings = {"planner.num_candidates": 7, "planner.optimizer.num_elites": 3}
-    planner = headway.load(root, settings=settings).agent.planner
-    wanted = dataclasses.replace(
-        RunDir(root).config().planner, num_candidates=7, optimizer=CEMConfig(num_elites=3)
-    )
-    assert planner == wanted
-
-
 def test_a_controller_can_go_on_learning(root):
     controller = headway.load(root, settings=LAST_LAYER)
     for _ in range(2):
         controller.act(OBS)
     assert controller.agent.model.prior is not None
     assert np.abs(controller._state.belief.last_layer.weight).max() > 0
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("model.num_heads", "model.num_heads cannot change here"),
-        ("evaluation.num_episodes", "evaluation.num_episodes cannot change here"),
-        ("planner.num_candidate", "unknown setting .* Did you mean 'planner.num_candidates'"),
-    ],
-)
-def test_what_a_controller_cannot_use_is_refused(name, message, root):
-    with pytest.raises(ConfigError, match=message):
-        headway.load(root, settings={name: 3})
+    with pytest.raises(ConfigError, match=r"evaluation\.num_episodes cannot change here"):
+        headway.load(root, settings={"evaluation.num_episodes": 3})
 
 
 def test_a_run_of_frozen_heads_is_tested_with_heads_that_learn(two_iterations):

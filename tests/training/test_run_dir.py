@@ -1,11 +1,11 @@
 """The run directory: checksums, going back, one process at a time, nothing half-written."""
 
-import ast
 import errno
 import fcntl
 import itertools
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -23,17 +23,15 @@ from headway.training.run import RunDir
 from headway.training.train import train_run
 from headway.training.trainers import make_trainer
 
-FILES = [
-    "config.json",
-    "metrics.jsonl",
-    "evaluation.csv",
-    "assignments.csv",
-    "prediction_error.csv",
-    "data/iteration-000.safetensors",
-    "data/iteration-001.safetensors",
-    "tests/iteration-001.safetensors",
-    "checkpoints/iteration-001.safetensors",
-]
+TABLES = ["metrics.jsonl", "evaluation.csv", "assignments.csv", "prediction_error.csv"]
+NAMES = (
+    "data/iteration-000",
+    "data/iteration-001",
+    "tests/iteration-001",
+    "checkpoints/iteration-001",
+)
+BINARY = [f"{name}.safetensors" for name in NAMES]
+FILES = ["config.json", *TABLES, *BINARY]
 NEWEST = "checksums/iteration-001.json"
 
 
@@ -74,7 +72,7 @@ def test_damage_to_any_file_is_named_with_the_way_back(name, how, root):
         assert "--resume-from-last-good" in text
 
 
-@pytest.mark.parametrize("name", [*FILES[-4:], NEWEST])
+@pytest.mark.parametrize("name", [*BINARY, NEWEST])
 def test_a_run_goes_on_from_its_last_good_iteration(name, root, reference):
     flip(root / name)
     with pytest.raises(RunError, match=r"last good iteration is 0|No earlier iteration"):
@@ -125,7 +123,7 @@ def test_what_is_read_is_what_was_written(root):
 
 
 def test_rows_of_an_unfinished_iteration_do_not_count(root, reference):
-    for name in FILES[1:5]:
+    for name in TABLES:
         with (root / name).open("a") as table:
             table.write("half a line")
     assert len(RunDir(root).metrics()) == 2
@@ -239,18 +237,13 @@ def test_any_bytes_are_refused_in_one_line(file, content):
     refused(load_arrays, file)
 
 
-PICKLES = {"pickle", "cloudpickle", "dill", "joblib", "marshal", "shelve", "yaml", "torch"}
-EVALUATING = {"eval", "exec", "compile", "__import__"}
+CODE_FROM_FILES = re.compile(
+    r"^ *(import|from) (pickle|cloudpickle|dill|joblib|marshal|shelve|yaml|torch)\b"
+    r"|(?<![\w.])(eval|exec|compile|__import__)\(|\b(allow_pickle|shell) ?=",
+    re.MULTILINE,
+)
 
 
 def test_nothing_in_the_package_can_turn_a_file_into_code():
     for path in Path(headway.__file__).parent.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Import):
-                assert not {name.name.partition(".")[0] for name in node.names} & PICKLES, path
-            if isinstance(node, ast.ImportFrom):
-                assert (node.module or "").partition(".")[0] not in PICKLES, path
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-                assert node.func.id not in EVALUATING, path
-            if isinstance(node, ast.keyword):
-                assert node.arg not in ("allow_pickle", "shell"), path
+        assert not CODE_FROM_FILES.search(path.read_text()), path

@@ -1,24 +1,18 @@
 """Head selection and calibration, measured on episodes and on numbers made by hand."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import toys
-from headway.config import CEMConfig, PlannerConfig
 from headway.data import History, Trajectory
 from headway.models.statistics import Statistics, network_input
 from headway.training.selection import EpisodeSelection, examine, summarise
 
-TINY = PlannerConfig(
-    horizon=3,
-    num_candidates=8,
-    optimizer=CEMConfig(num_elites=2),
-    num_iterations=1,
-    num_particles=2,
-    selection_length=3,
-)
+TINY = dataclasses.replace(toys.TINY, selection_length=3)
 
 
 def make_agent(net, statistics=None):
