@@ -7,7 +7,6 @@ from pathlib import Path
 
 import jax
 import pytest
-from machine import machine_kind
 from reporting import NOT_MEASURED, Report, Target
 from workloads import make_agent, make_fit
 
@@ -19,11 +18,6 @@ SMALL = MultiHeadedConfig(num_members=2, hidden_sizes=(8, 8), context_hidden_siz
 PLAN = Target("plan", "cpu", "a plan", 0.8, "ratio", "")
 RATE = Target("updates", "cpu", "updates", 100.0, "value", "/s", "at least")
 GPU_PLAN = Target("plan", "gpu", "a plan", 4.0, "ratio", "")
-
-
-def test_machine_kind_names_the_device():
-    assert machine_kind("cpu", "cpu", 2, matrix_units=True) == "cpu-2-cores-amx"
-    assert machine_kind("gpu", "NVIDIA H100 80GB HBM3", 2, matrix_units=False) == "h100"
 
 
 def test_report_sets_targets_beside_what_was_measured(tmp_path, monkeypatch):
@@ -54,10 +48,7 @@ def test_what_is_timed_runs_at_a_small_size():
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (
-            "scores results/pendulum-quick",
-            "| tmcl | 0.99 0.96 0.99 | 0.98 | 0.65 0.65 0.53 |",
-        ),
+        ("scores results/pendulum-quick", "| tmcl | 0.99 0.96 0.99 | 0.98 | 0.65 0.65 0.53 |"),
         ("arms results/adaptation/pendulum-quick", "| tmcl | none | 0.99 0.96 0.99 (mean 0.98) |"),
         ("planners results/planners/pendulum.csv", "| paper | 60.5, 1.71e+03, 1.03 |"),
     ],

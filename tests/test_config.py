@@ -23,7 +23,6 @@ from headway.config import (
     SimulatorConfig,
     differences,
     from_dict,
-    known_settings,
     override,
     to_dict,
     tolerating_as,
@@ -75,12 +74,6 @@ def test_defaults_are_the_papers():
     assert (planner.horizon, planner.num_candidates, planner.num_iterations) == (30, 200, 5)
     assert (planner.num_particles, planner.selection_length) == (20, 10)
     assert (DEFAULT.collection.num_iterations, DEFAULT.collection.num_episodes) == (10, 10)
-
-
-def test_every_leaf_has_a_dotted_name():
-    names = known_settings()
-    assert {"env", "sim_params", "planner.horizon", "planner.optimizer.num_elites"} <= set(names)
-    assert not {"model", "planner", "planner.optimizer"} & set(names)
 
 
 def test_override_replaces_the_named_settings_only():
@@ -145,7 +138,6 @@ def test_a_setting_that_does_not_exist_is_refused_with_the_closest(wrong, said):
         ("planner.horizon", "many", "a valid integer"),
         ("planner.horizon", 3.0, "a valid integer"),
         ("planner.horizon", True, "a valid integer"),
-        ("planner.horizon", None, "a valid integer"),
         ("planner.horizon", 0, "greater than or equal to 1"),
         ("planner.horizon", 10**30, "less than or equal to"),
         ("planner.optimizer.smoothing", 1.5, "less than or equal to 1"),
@@ -155,13 +147,11 @@ def test_a_setting_that_does_not_exist_is_refused_with_the_closest(wrong, said):
         ("model.kind", "unheard", "Allowed: multi-headed, gradient-adapted, recurrent, "),
         ("model.hidden_sizes", 200, "a valid tuple"),
         ("model.hidden_sizes", [], "at least 1 item"),
-        ("fitting.learning_rate", "fast", "a valid number"),
         ("fitting.learning_rate", float("nan"), "a finite number"),
         ("fitting.bootstrap", 1, "a valid boolean"),
         ("fitting.oracle", "trajectry", "'trajectory'. Did you mean 'trajectory'?"),
         ("evaluation.num_episodes", 1001, "less than or equal to 1000"),
         ("seed", -1, "greater than or equal to 0"),
-        ("env", 3, "a valid string"),
     ],
 )
 def test_a_bad_value_is_refused_by_name_in_one_line(name, value, allowed):

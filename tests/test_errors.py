@@ -26,12 +26,7 @@ def test_every_error_is_a_headway_error_and_a_builtin_one(kind, builtin):
     [
         ("option", "foo", [], "unknown option 'foo'. There is none; leave it out."),
         ("method", "zzz", ["tmcl", "pets"], "unknown method 'zzz'. Allowed: pets, tmcl."),
-        (
-            "env",
-            "peg",
-            ["pets", "peg2"],
-            "unknown env 'peg'. Did you mean 'peg2'? Allowed: peg2, pets.",
-        ),
+        ("env", "peg", ["x", "peg2"], "unknown env 'peg'. Did you mean 'peg2'? Allowed: peg2, x."),
     ],
 )
 def test_an_unknown_name_lists_all_and_suggests_the_closest(kind, got, names, text):

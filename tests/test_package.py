@@ -87,10 +87,6 @@ def test_wheel_holds_the_package_and_its_type_marker(tmp_path):
     }
 
 
-def test_readme_is_short():
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 150
-
-
 def requirements() -> list[Requirement]:
     """Everything that pyproject.toml asks for, the GPU build aside."""
     found = [*PROJECT["project"]["dependencies"], *PROJECT["build-system"]["requires"]]

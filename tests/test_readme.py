@@ -188,15 +188,8 @@ def test_an_own_model_is_fitted_resumed_and_planned_with(tmp_path):
         "pendulum", method="ridge", preset="smoke", run_dir=tmp_path / "a", settings=settings
     )
     weight = load_agent(RunDir(first.path)).model.parameters  # pyright: ignore
-    trajectories = RunDir(first.path).load_data()
-    obs, action, next_obs = (
-        np.concatenate([getattr(t, name)[part] for t in trajectories])
-        for name, part in (
-            ("obs", slice(None, -1)),
-            ("action", slice(None)),
-            ("obs", slice(1, None)),
-        )
-    )
+    parts = [(t.obs[:-1], t.action, t.obs[1:]) for t in RunDir(first.path).load_data()]
+    obs, action, next_obs = map(np.concatenate, zip(*parts, strict=True))
     x = np.concatenate([obs, action, np.ones((len(obs), 1))], axis=1)
     expected = np.linalg.lstsq(x, next_obs - obs)[0]
     np.testing.assert_allclose(x @ weight, x @ expected, atol=1e-3)
