@@ -31,7 +31,7 @@ def test_every_figure_is_drawn_and_settings_of_the_user_stay(run_dir):
     assert dict(matplotlib.rcParams) == before
 
 
-@pytest.mark.parametrize(("missing", "figure"), zip(TABLES, ALL, strict=True))
+@pytest.mark.parametrize(("missing", "figure"), list(zip(TABLES, ALL, strict=True)))
 def test_a_missing_file_leaves_its_figure_out(run_dir, missing, figure):
     (run_dir / missing).unlink()
     names = [path.name for path in save_run_figures(run_dir)]
