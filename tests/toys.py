@@ -1,5 +1,6 @@
 """Tiny tasks, data and exactly known models that the tests of the core share."""
 
+import dataclasses
 import functools
 from typing import ClassVar
 
@@ -136,6 +137,9 @@ def linear_model(gains):
     return MultiHeadNet(GaussianNet((hidden,), mean_heads, None, None, None), None, None)
 
 
+UP_DOWN = linear_model([[np.eye(2), -np.eye(2)], [-np.eye(2), np.eye(2)]])
+
+
 def with_noise(net, stds):
     """A deterministic network of one member whose heads have noise of known deviations."""
     logvar = 2 * jnp.log(jnp.asarray(stds))[None, :, None]
@@ -153,11 +157,21 @@ def predict(net, x, context=None):
     return jax.tree.map(lambda values: values.mT, columns)
 
 
-def make_agent(net, planner, *, statistics=None, task=POINT, history_length=3, prior=None):
-    """An agent that acts with some networks."""
+def make_agent(net=UP_DOWN, planner=TINY, *, statistics=None, task=POINT, prior=None, **settings):
+    """An agent that acts with some networks; further settings change the planner's."""
+    planner = dataclasses.replace(planner, **settings)
     statistics = statistics or identity_statistics(task)
-    model = MultiHeadModel(net, statistics, task, planner, history_length, prior)
-    return Agent(model, task, planner)
+    return Agent(MultiHeadModel(net, statistics, task, planner, 3, prior), task, planner)
+
+
+def walk(agent, num_envs=3, steps=3, seed=0):
+    """The agent's actions, [step, env, ...], when it sees random observations."""
+    state, found = agent.init(num_envs, key=jax.random.key(seed)), []
+    observed = np.random.default_rng(1).normal(size=(steps, num_envs, 2)).astype(np.float32)
+    for obs in observed:
+        state, decision = agent.act(state, obs)
+        found.append(np.asarray(decision.action))
+    return np.stack(found)
 
 
 def reset_where(state, fresh, done):

@@ -10,7 +10,6 @@ import pytest
 import toys
 from headway.errors import ConfigError
 from headway.models.last_layer import Prior
-from headway.models.multi_headed import MultiHeadNet
 
 LAST_LAYER = dataclasses.replace(toys.TINY, selection_length=3, adaptation="last-layer")
 
@@ -27,9 +26,8 @@ def even_prior(model, ratio=1e4, noise=1e-4):
 
 
 def make_agent(model=WRONG, prior=None, **settings):
-    planner = dataclasses.replace(LAST_LAYER, **settings)
     prior = even_prior(model) if prior is None else prior
-    return toys.make_agent(model, planner, prior=prior)
+    return toys.make_agent(model, LAST_LAYER, prior=prior, **settings)
 
 
 def play(agent, gain, steps, *, state=None, spike=None, first_random=0):
@@ -95,16 +93,6 @@ def test_absurd_observations_give_finite_actions_and_are_not_learned(value, sett
     state, decisions = play(agent, 1.0, 8, spike=spike)
     toys.assert_finite([[decision.action for decision in decisions], state.belief.last_layer])
     assert np.abs(state.belief.last_layer.weight).max() < 1e3
-
-
-def test_one_head_without_context_and_deterministic_models_learn_too():
-    config = dataclasses.replace(toys.SMALL, num_heads=1, context_size=0, deterministic=True)
-    model = MultiHeadNet.init(
-        dataclasses.replace(config, backward_net=False), toys.POINT, key=jax.random.key(0)
-    )
-    state, decisions = play(make_agent(model), 1.0, 5)
-    assert np.isfinite(decisions[-1].action).all()
-    assert np.abs(state.belief.last_layer.weight).max() > 0.0
 
 
 def test_changed_physics_are_noticed_and_what_was_learned_is_dropped():

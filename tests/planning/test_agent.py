@@ -9,27 +9,20 @@ import numpy as np
 import toys
 from headway.config import CEMConfig
 from headway.models.base import FunctionModel
-from headway.models.statistics import Statistics
 from headway.planning.agent import Agent
 
-UP_DOWN = toys.linear_model([[np.eye(2), -np.eye(2)], [-np.eye(2), np.eye(2)]])
 OBS = jnp.asarray([[0.5, 0.5], [0.1, -0.4]])
-
-
-def make_agent(net=UP_DOWN, *, statistics=None, **settings):
-    return toys.make_agent(net, dataclasses.replace(toys.TINY, **settings), statistics=statistics)
 
 
 def start(agent, num_envs=2, seed=0):
     return agent.init(num_envs, key=jax.random.key(seed))
 
 
-def play(agent, gains, steps, *, state=None, obs=None):
+def play(agent, gains, steps):
     """Let the agent act on `obs' = obs + gain * action`; every observation and decision."""
     gains = np.asarray(gains, np.float32)[:, None]
-    state = start(agent, len(gains)) if state is None else state
-    seen = [np.tile(np.float32([0.8, -0.6]), (len(gains), 1)) if obs is None else obs]
-    decisions = []
+    state, decisions = start(agent, len(gains)), []
+    seen = [np.tile(np.float32([0.8, -0.6]), (len(gains), 1))]
     for _ in range(steps):
         state, decision = agent.act(state, seen[-1])
         decisions.append(decision)
@@ -37,34 +30,19 @@ def play(agent, gains, steps, *, state=None, obs=None):
     return state, np.stack(seen), decisions
 
 
-def test_actions_are_bounded_finite_and_of_the_tasks_shape():
-    _, _, decisions = play(make_agent(), [1.0, -1.0], 3)
-    for decision in decisions:
-        assert decision.action.shape == (2, 2)
-        assert decision.heads.shape == (2, 2)
-        assert np.abs(np.asarray(decision.action)).max() <= 1.0
-        np.testing.assert_array_equal(decision.failures, 0)
-        np.testing.assert_array_equal(
-            decision.evaluations, toys.TINY.num_candidates * toys.TINY.num_iterations
-        )
-
-
 def test_heads_and_actions_follow_each_environments_own_physics_after_one_step():
-    _, seen, decisions = play(make_agent(), [1.0, -1.0], 6)
+    _, seen, decisions = play(toys.make_agent(), [1.0, -1.0], 6)
+    for decision in decisions:
+        assert np.abs(decision.action).max() <= 1.0
+        np.testing.assert_array_equal(decision.failures, 0)
+        np.testing.assert_array_equal(decision.evaluations, 60 * 4)
     for decision in decisions[1:]:
         assert decision.heads.tolist() == [[0, 1], [1, 0]]
     assert (np.square(seen[-1]).sum(-1) < 0.15 * np.square(seen[1]).sum(-1).max() + 0.05).all()
 
 
-def test_a_change_of_physics_is_noticed_within_n_steps():
-    agent = make_agent()
-    state, seen, _ = play(agent, [1.0, 1.0], 3)
-    decisions = play(agent, [-1.0, -1.0], 4, state=state, obs=seen[-1] + np.float32(0.7))[2]
-    assert decisions[3].heads.tolist() == [[1, 0], [1, 0]]
-
-
 def test_same_state_same_action_and_the_key_moves_on():
-    agent = make_agent(toys.small_model())
+    agent = toys.make_agent(toys.small_model())
     state = start(agent)
     after, first = agent.act(state, OBS)
     _, again = agent.act(state, OBS)
@@ -77,50 +55,20 @@ def test_same_state_same_action_and_the_key_moves_on():
     assert (first.action[0] != beside.action[0]).any()
 
 
-def test_an_environment_without_finite_returns_keeps_its_plan_and_is_counted_alone():
-    agent = make_agent()
-    state, seen, _ = play(agent, [1.0, 1.0], 2)
-    _, healthy = agent.act(state, seen[-1])
-    after, decision = agent.act(state, np.stack([[np.nan, np.nan], seen[-1][1]]))
-    np.testing.assert_array_equal(decision.failures, [toys.TINY.num_iterations, 0])
-    nominal, shifted = (next(iter(s.search)) for s in (state, after))
-    np.testing.assert_array_equal(decision.action[0], nominal[0, 0])
-    np.testing.assert_array_equal(shifted[0, :-1], nominal[0, 1:])
-    np.testing.assert_array_equal(decision.action[1], healthy.action[1])
-
-
 def test_random_selection_ignores_the_data_and_draws_anew_at_every_step():
-    _, _, decisions = play(make_agent(head_selection="random"), [1.0, 1.0], 25)
+    _, _, decisions = play(toys.make_agent(head_selection="random"), [1.0, 1.0], 25)
     assert len({str(decision.heads[0].tolist()) for decision in decisions}) == 4
 
 
 def test_averaging_plans_with_all_heads_and_reports_the_adaptive_one():
-    agent = make_agent(head_selection="average")
+    agent = toys.make_agent(head_selection="average")
     state, _, decisions = play(agent, [1.0, -1.0], 2)
     assert decisions[1].heads.tolist() == [[0, 1], [1, 0]]
     obs_size = agent.task.obs_size
     average = agent.model.dynamics(state.belief).own.layer
-    chosen = make_agent().model.dynamics(state.belief).own.layer
+    chosen = toys.make_agent().model.dynamics(state.belief).own.layer
     np.testing.assert_array_equal(average.weight[..., :obs_size, :], 0.0)  # up and down
     assert np.asarray(chosen.weight[..., :obs_size, :]).any()
-
-
-def test_the_released_codes_choices_of_planning_act_too():
-    choices = {"selection_error": "sampled", "selection_skips_newest": True, "reward": "released"}
-    _, _, decisions = play(make_agent(toys.small_model(), **choices), [1.0, -1.0], 3)
-    assert np.isfinite(decisions[-1].action).all()
-    np.testing.assert_array_equal(decisions[-1].failures, 0)
-
-
-def test_a_constant_observation_dimension_plans_without_failures():
-    trajectories = [toys.random_trajectory(6, seed=n, constant=True) for n in range(2)]
-    statistics = Statistics.fit(toys.POINT, trajectories, 3)
-    agent = make_agent(toys.small_model(), statistics=statistics)
-    state = start(agent)
-    for _ in range(3):
-        state, decision = agent.act(state, jnp.asarray([[0.5, 0.2], [0.1, 0.2]]))
-        assert np.isfinite(decision.action).all()
-        np.testing.assert_array_equal(decision.failures, 0)
 
 
 def test_any_function_can_be_planned_with():
@@ -142,17 +90,12 @@ def test_an_agent_without_a_model_acts_at_random():
 
 
 def test_reduced_precision_chooses_nearly_the_same_actions():
-    observed = np.random.default_rng(1).normal(size=(8, 3, 2)).astype(np.float32)
     planner = {"horizon": 5, "num_candidates": 40, "optimizer": CEMConfig(num_elites=8)}
     planner |= {"num_iterations": 3, "num_particles": 4, "selection_length": 10}
 
     def actions(**settings):
-        agent = make_agent(toys.small_model(seed=3), **planner | settings)
-        state, found = start(agent, 3), []
-        for obs in observed:
-            state, decision = agent.act(state, obs)
-            found.append(np.asarray(decision.action))
-        return np.stack(found)
+        agent = toys.make_agent(toys.small_model(seed=3), **planner | settings)
+        return toys.walk(agent, steps=8)
 
     exact, reduced, other = actions(), actions(precision="bfloat16"), actions(num_candidates=41)
     difference = np.abs(exact - reduced)

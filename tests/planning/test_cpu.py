@@ -1,6 +1,5 @@
 """Cores that share the candidates of a plan choose what one program would choose; their noise."""
 
-import dataclasses
 import os
 import subprocess
 import sys
@@ -8,34 +7,22 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import toys
-from headway.config import ICEMConfig, MPPIConfig, RandomShootingConfig
+from headway.config import CEMConfig, ICEMConfig, MPPIConfig, RandomShootingConfig
 from headway.planning import cpu
 from headway.planning.controller import Controller
-from headway.planning.cpu import Shard, in_shards, joined, normal_block, threefry2x32
-from headway.planning.rollouts import candidate_returns
+from headway.planning.cpu import Shard, in_shards, normal_block, threefry2x32
 
-TINY = dataclasses.replace(toys.TINY, num_particles=4)
-OBS = np.ones((3, 2), np.float32)
+OBS = np.random.default_rng(2).normal(size=(3, 2)).astype(np.float32)
 
 
 def make_agent(**settings):
-    return toys.make_agent(toys.small_model(seed=3), dataclasses.replace(TINY, **settings))
-
-
-def walk(agent, num_envs=3, steps=3, seed=0):
-    state, found = agent.init(num_envs, key=jax.random.key(seed)), []
-    observed = np.random.default_rng(1).normal(size=(steps, num_envs, 2)).astype(np.float32)
-    for obs in observed:
-        state, decision = agent.act(state, obs)
-        found.append(np.asarray(decision.action))
-    return np.stack(found)
+    return toys.make_agent(toys.small_model(seed=3), num_particles=4, **settings)
 
 
 @pytest.fixture
@@ -46,43 +33,28 @@ def sharing(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "settings",
+    ("caches", "settings"),
     [
-        {},
-        {"num_candidates": 41, "precision": "bfloat16", "particle_noise": "shared"},
-        {"optimizer": ICEMConfig(num_elites=4)},
-        {"optimizer": MPPIConfig()},
-        {"optimizer": RandomShootingConfig()},
+        (1, {"reward": "released", "selection_error": "sampled", "selection_skips_newest": True}),
+        (2**20, {"num_candidates": 2, "optimizer": CEMConfig(num_elites=1)}),  # side by side
+        (1, {"num_candidates": 41, "precision": "bfloat16", "particle_noise": "shared"}),
+        (2**20, {"optimizer": ICEMConfig(num_elites=4)}),
+        (1, {"optimizer": MPPIConfig()}),  # environments in turns
+        (2**20, {"optimizer": RandomShootingConfig()}),
     ],
     ids=str,
 )
-def test_cores_that_share_a_plan_choose_the_actions_of_one_program(settings, sharing, monkeypatch):
-    agent = make_agent(**settings)
-    shared, timed = walk(agent), Controller(agent, deadline_ms=1e7).act(OBS[0])
-    monkeypatch.setattr(cpu, "LEAST_STEPS", np.inf)
-    np.testing.assert_allclose(shared, walk(agent), atol=1e-5)
-    np.testing.assert_allclose(timed, Controller(agent).act(OBS[0]), atol=1e-5)
-
-
-@pytest.mark.parametrize("caches", [1, cpu.CACHES_OF_CORE], ids=["in turns", "side by side"])
-@pytest.mark.parametrize(("shards", "noise"), [(2, "independent"), (4, "shared"), (40, "shared")])
-def test_shards_have_the_returns_of_the_whole(shards, noise, caches, monkeypatch):
+def test_cores_that_share_a_plan_choose_the_actions_of_one_program(
+    caches, settings, sharing, monkeypatch
+):
     monkeypatch.setattr(cpu, "CACHES_OF_CORE", caches)
-    agent, rng = make_agent(particle_noise=noise), np.random.default_rng(3)
-    context = jnp.asarray(rng.normal(size=(2, 3, 3)), jnp.float32)
-    heads = jnp.asarray(rng.integers(0, 2, (3, 2)))
-    belief = agent.model.init_belief(3)._replace(context=context, heads=heads)
-    candidates = jnp.asarray(rng.uniform(-1, 1, (3, 7, 4, 2)), jnp.float32)
-    args = agent.model.dynamics(belief), toys.POINT, jnp.asarray(OBS), candidates
-    returns_of = eqx.filter_jit(
-        lambda shard: candidate_returns(
-            *args, planner=agent.planner, key=jax.random.key(1), shard=shard
-        )
-    )
-    found = joined(in_shards(returns_of, 7, shards), 7)
-    whole = returns_of(None)
-    np.testing.assert_allclose(found, whole, rtol=1e-5)
-    assert len(np.unique(whole)) == whole.size
+    agent = make_agent(**settings)
+    plain, timed = Controller(agent), Controller(agent, deadline_ms=1e7)
+    shared, in_time = toys.walk(agent), [timed.act(obs) for obs in OBS]
+    assert timed.status.outcome == "planned"
+    monkeypatch.setattr(cpu, "LEAST_STEPS", np.inf)
+    np.testing.assert_allclose(shared, toys.walk(agent), atol=1e-5)
+    np.testing.assert_allclose(in_time, [plain.act(obs) for obs in OBS], atol=1e-4)
 
 
 def test_number_of_shards(monkeypatch):
@@ -136,53 +108,36 @@ def test_an_error_in_another_thread_is_raised(monkeypatch):
             in_shards(fails_elsewhere, 4, 2)
 
 
-MANY_THREADS = """
-import sys, numpy as np
+IN_THREADS = """
+import sys, threading, numpy as np
 from concurrent.futures import ThreadPoolExecutor
 from headway.planning import cpu
-from planning.test_cpu import make_agent, walk
+from planning.test_cpu import make_agent, toys
 cpu.LEAST_STEPS, cpu.num_cpus = 1, lambda: 3
-plan = lambda seed: walk(make_agent(), 1, int(sys.argv[1]), seed)
+plan = lambda seed: toys.walk(make_agent(), 1, int(sys.argv[1]), seed)
 wanted = [plan(seed) for seed in range(3)]
 with ThreadPoolExecutor(3) as threads:
     print([np.array_equal(*pair) for pair in zip(threads.map(plan, range(3)), wanted)])
-"""
-
-AFTER_THE_MAIN_THREAD = """
-import threading
-from headway.planning import cpu
-from planning.test_cpu import make_agent, walk
-cpu.LEAST_STEPS, cpu.num_cpus = 1, lambda: 3
-walk(make_agent(), 1, 1)
 def late():
     threading.main_thread().join()
-    print(walk(make_agent(), 1, 2).shape)
+    print(toys.walk(make_agent(), 1, 2).shape)
 threading.Thread(target=late).start()
 """
 
 
-def printed_by(program, *args, seconds=120):
-    """What a Python, which can import what the tests can, has printed once it has ended well."""
+@pytest.mark.parametrize("plans", [30, pytest.param(2_000, marks=pytest.mark.slow)])
+def test_controllers_in_several_threads_share_the_cores_and_may_outlive_the_main_one(plans):
     paths = [str(Path(toys.__file__).parent), *sys.path]
     done = subprocess.run(
-        [sys.executable, "-c", program, *args],
+        [sys.executable, "-c", IN_THREADS, str(plans)],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
         capture_output=True,
         text=True,
-        timeout=seconds,
+        timeout=max(240, plans),
         check=False,
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    return done.stdout.strip()
-
-
-@pytest.mark.parametrize("plans", [30, pytest.param(2_000, marks=pytest.mark.slow)])
-def test_controllers_in_several_threads_share_the_cores_and_end(plans):
-    assert printed_by(MANY_THREADS, str(plans), seconds=max(120, plans)) == "[True, True, True]"
-
-
-def test_a_controller_may_outlive_the_main_thread():
-    assert printed_by(AFTER_THE_MAIN_THREAD) == "(2, 1, 2)"
+    assert done.stdout.split("\n") == ["[True, True, True]", "(2, 1, 2)", ""]
 
 
 # The noise of imagined steps, against JAX's own generator.

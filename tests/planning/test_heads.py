@@ -18,13 +18,12 @@ from headway.models.statistics import Normalizer, network_input
 from headway.planning.controller import Controller
 
 UP, DOWN = 1.0, -1.0
-NET = toys.linear_model([[np.eye(2), -np.eye(2)], [-np.eye(2), np.eye(2)]])
 UP_HEADS, DOWN_HEADS = [0, 1], [1, 0]  # the heads of the two members that know each physics
 SLOTS = 6
 YES = jnp.asarray([True])
 
 
-def model_of(net=NET, *, statistics=None, task=toys.POINT, planner=None):
+def model_of(net=toys.UP_DOWN, *, statistics=None, task=toys.POINT, planner=None):
     statistics = statistics or toys.identity_statistics(task)
     return MultiHeadModel(net, statistics, task, planner or PlannerConfig(), 3)
 
@@ -46,7 +45,7 @@ def chosen(model, recent, keys):
     return model.choose_heads(recent, None, keys)
 
 
-def choose(pushes, *, net=NET, statistics=None, key=0, **settings):
+def choose(pushes, *, net=toys.UP_DOWN, statistics=None, key=0, **settings):
     model = model_of(net, statistics=statistics, planner=PlannerConfig(**settings))
     keys = jnp.stack([jax.random.key(key), jax.random.key(7)])
     return chosen(model, remember(pushes), keys)[0].tolist()
@@ -197,7 +196,7 @@ def test_heads_compete_with_the_context_of_their_environment_and_member(place):
 def told_agent():
     net = net_at("input", context="sim-params", num_heads=1)
     statistics = toys.odd_statistics(TASK, sim_param_names=NAMES)
-    return toys.make_agent(net, toys.TINY, statistics=statistics, task=TASK)
+    return toys.make_agent(net, statistics=statistics, task=TASK)
 
 
 def test_an_agent_that_is_told_the_physics_plans_with_them():
@@ -229,7 +228,7 @@ def test_a_controller_that_was_not_told_the_physics_says_what_to_do():
 
 
 def test_other_controllers_take_no_notice_of_the_physics():
-    agent = toys.make_agent(net_at("head"), toys.TINY, task=TASK)
+    agent = toys.make_agent(net_at("head"), task=TASK)
     first, second = Controller(agent), Controller(agent)
     first.reset(sim_params={"gain": 1.0})
     second.reset()
