@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ import pytest
 import toys
 from headway.data import Episodes, History
 from headway.errors import ConfigError
-from headway.models.multi_headed import MultiHeadNet
 from headway.models.statistics import Statistics, network_input
 
 TASK = toys.ScaledTask()
@@ -99,41 +97,6 @@ def test_each_kind_of_context_has_its_values(kind):
         "sim-params": (sim_params - physics.mean) / physics.std,
     }[kind]
     np.testing.assert_allclose(context, expected, rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    "switches",
-    [{}, {"context_size": 0}, {"backward_net": False}, {"deterministic": True}],
-    ids=str,
-)
-def test_every_switch_of_the_model_builds_and_predicts(switches):
-    config = dataclasses.replace(toys.SMALL, **switches)
-    model = MultiHeadNet.init(config, TASK, key=jax.random.key(0))
-    statistics = Statistics.identity(TASK, config.history_length)
-    obs, action, history, _ = random_input()
-    context = model.context(history, statistics)
-    prediction = toys.predict(
-        model.forward_net, network_input(TASK, statistics, obs, action), context
-    )
-    assert prediction.mean.shape == (2, 2, 5, 2)
-    assert (context is None) == (config.context_size == 0)
-    assert (model.backward_net is None) == (not config.backward_net)
-    assert (prediction.logvar is None) == config.deterministic
-    assert (model.num_members, model.num_heads) == (2, 2)
-    toys.assert_finite(prediction)
-
-
-def test_a_model_in_reduced_precision_keeps_its_weights_and_its_first_layers():
-    config = dataclasses.replace(toys.SMALL, num_heads=1, relation_head=True)
-    model = toys.small_model(config=config)
-    reduced = model.in_precision("bfloat16")
-    for net in (reduced.forward_net, reduced.backward_net):
-        assert [layer.precision for layer in net.hidden] == ["float32", "bfloat16"]
-        assert (net.mean_heads.precision, net.logvar_heads.precision) == ("bfloat16", "bfloat16")
-    assert {layer.precision for layer in reduced.context_encoder.hidden} == {"bfloat16"}
-    assert reduced.relation_head.precision == "float32"
-    for a, b in zip(jax.tree.leaves(model), jax.tree.leaves(reduced), strict=True):
-        assert a is b
 
 
 def test_statistics_equal_their_numpy_twins_over_ragged_episodes():

@@ -107,12 +107,8 @@ def test_numbers_are_rounded_to_the_nearest_bfloat16_and_halves_away_from_zero()
 
 
 def test_reduced_products_and_gradients_are_those_of_rounded_factors():
-    x, weight, bias, gradient = (
-        draws(0, 2, 5, 7),
-        draws(1, 2, 5, 4),
-        draws(3, 2, 4),
-        draws(2, 2, 4, 7),
-    )
+    x, weight = draws(0, 2, 5, 7), draws(1, 2, 5, 4)
+    bias, gradient = draws(3, 2, 4), draws(2, 2, 4, 7)
     out, back = jax.vjp(lambda *layer: affine(*layer, "bfloat16"), x, weight, bias)
     columns, matrix, above = (
         np.asarray(rounded(values, jnp.bfloat16).astype(jnp.float32), np.float64)

@@ -9,11 +9,7 @@ import toys
 from headway.config import RecurrentConfig
 from headway.models.fitting import FitState
 from headway.models.grbal import Window
-from headway.models.rebal import (
-    RecurrentNet,
-    batch_gradient,
-    recurrent_epoch,
-)
+from headway.models.rebal import RecurrentNet, batch_gradient, recurrent_epoch
 
 truncated = jax.jit(batch_gradient, static_argnums=2)
 

@@ -59,15 +59,11 @@ def transitions(count, num_envs=2, seed=0):
 
 
 @eqx.filter_jit
-def lived(model, steps, keys):
+def live(model, steps):
     belief = model.init_belief(len(steps[0].obs))
     for step in steps:
-        belief = model.observe(belief, step, keys)
+        belief = model.observe(belief, step, KEYS)
     return belief
-
-
-def live(model, steps):
-    return lived(model, steps, KEYS)
 
 
 @eqx.filter_jit
