@@ -76,7 +76,11 @@ def check_whole(job, calm, before=()):
     assert run.evaluation() == RunDir(calm).evaluation()
 
 
-@pytest.mark.parametrize("workers", [HERE, Workers()], ids=["processes", "ray"])
+@pytest.mark.parametrize(
+    "workers",
+    [pytest.param(HERE, marks=pytest.mark.slow), Workers()],
+    ids=["processes", "ray"],
+)
 @pytest.mark.usefixtures("two_cores")
 def test_a_worker_that_is_killed_loses_nothing(workers, tmp_path, capsys):
     jobs, written = make_jobs(tmp_path, 2), []

@@ -226,7 +226,10 @@ def memory() -> int:
 
 @pytest.mark.parametrize(
     ("deadline_ms", "steps"),
-    [(None, 1000), (LONG, 400), pytest.param(None, 10_000, marks=pytest.mark.slow)],
+    [
+        (None, 1000),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in [(LONG, 400), (None, 10_000)]),
+    ],
 )
 def test_many_steps_take_no_more_memory(deadline_ms, steps):
     controller = Controller(toys.make_agent(num_iterations=2), deadline_ms=deadline_ms)

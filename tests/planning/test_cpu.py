@@ -38,9 +38,14 @@ def sharing(monkeypatch):
         (1, {"reward": "released", "selection_error": "sampled", "selection_skips_newest": True}),
         (2**20, {"num_candidates": 2, "optimizer": CEMConfig(num_elites=1)}),  # side by side
         (1, {"num_candidates": 41, "precision": "bfloat16", "particle_noise": "shared"}),
-        (2**20, {"optimizer": ICEMConfig(num_elites=4)}),
-        (1, {"optimizer": MPPIConfig()}),  # environments in turns
-        (2**20, {"optimizer": RandomShootingConfig()}),
+        *(
+            pytest.param(caches, {"optimizer": optimizer}, marks=pytest.mark.slow)
+            for caches, optimizer in [
+                (2**20, ICEMConfig(num_elites=4)),
+                (1, MPPIConfig()),  # environments in turns
+                (2**20, RandomShootingConfig()),
+            ]
+        ),
     ],
     ids=str,
 )
@@ -160,7 +165,8 @@ def test_a_block_is_that_of_the_whole(impl):
     key = jax.random.key(9, impl=impl)
     whole = jax.random.normal(key, (4, 3, 2, 10))
     block = jax.jit(lambda start: normal_block(key, whole.shape, (start, 0, 1, 5), (2, 3, 1, 4)))
-    np.testing.assert_array_equal(block(1), whole[1:3, :, 1:, 5:9])
+    # With the flags of conftest.py XLA compiles the two programs one unit apart.
+    np.testing.assert_array_max_ulp(block(1), whole[1:3, :, 1:, 5:9], 1)
 
 
 @pytest.mark.parametrize(

@@ -176,7 +176,14 @@ def test_a_signal_stops_with_all_that_is_finished(number, at, kept, reference, t
     assert runs.result(path) == runs.result(reference)
 
 
-@pytest.mark.parametrize("method", ["grbal", "rebal", "ria", "true-dynamics"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        "grbal",
+        "true-dynamics",
+        *(pytest.param(m, marks=pytest.mark.slow) for m in ("rebal", "ria")),
+    ],
+)
 def test_a_run_of_any_kind_goes_on_where_it_stopped(method, tmp_path):
     config = make_config("pendulum", method=method, preset="smoke")
     train.train_run(config, tmp_path / "whole")

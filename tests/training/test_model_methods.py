@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import headway
 import toys
@@ -67,6 +68,7 @@ def fitted_error(method):
     return float(np.square(got - delta).mean() / delta.var())
 
 
+@pytest.mark.slow
 def test_history_and_true_parameters_help_where_the_mass_is_hidden():
     errors = {method: fitted_error(method) for method in ("vanilla", "stacked", "oracle-params")}
     assert errors["vanilla"] > 0.15
