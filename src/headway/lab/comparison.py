@@ -14,7 +14,7 @@ import pandas as pd
 from rich.table import Table
 
 from headway.lab import figures, report, tables
-from headway.lab.statistics import MIN_RUNS, caution, compare, estimate, unlike, verdict
+from headway.lab.statistics import MIN_RUNS, caution, compare, estimate, mismatches, verdict
 from headway.lab.sweep import NOTE, Cell, Comparison, Workers, run_jobs
 from headway.training.files import write_bytes, write_json
 
@@ -231,20 +231,20 @@ def verdicts(found: Found) -> list[str]:
     """
     reference = found.comparison.experiment.reference_arm.label
     parts = found.parts[found.parts.group != tables.TRAIN]
-    lines, counts, strange = [], [], []
+    lines, counts, differing = [], [], []
     for arm in found.comparison.experiment.arms:
         if arm.label == reference:
             continue
         both = parts[parts.label.isin([reference, arm.label])]
-        strange += [f"{arm.label} on {env}" for env in dict(unlike(both))]
+        differing += [f"{arm.label} on {env}" for env in dict(mismatches(both))]
         shown = compare(parts, reference, arm.label, "return_mean")
         if shown is not None:
             lines.append(verdict(reference, arm.label, shown))
             counts += [shown.num_runs] * bool(shown.interval)
-    if strange:
+    if differing:
         lines.append(
             f"Not compared with {reference}, because physics, episode lengths or options of the"
-            f" environment differ: {'; '.join(strange)}."
+            f" environment differ: {'; '.join(differing)}."
         )
     return [*lines, *filter(None, [caution(min(counts))] if counts else [])]
 

@@ -170,11 +170,11 @@ def _matrix(parts: pd.DataFrame, label: str, column: str = "value") -> pd.DataFr
     return own.unstack("group").reindex(columns=_groups(parts))
 
 
-def _unlike(page: Page, env: str | None = None) -> list[str]:
+def _mismatches(page: Page, env: str | None = None) -> list[str]:
     """Warn of numbers that stand beside each other but are of other tasks."""
     found = [
         f"{where}, {group}"
-        for where, group in statistics.unlike(page.parts)
+        for where, group in statistics.mismatches(page.parts)
         if env == where or (env is None and group != TRAIN)
     ]
     text = "Not tested alike, so not compared: other physics, episode lengths or options in "
@@ -208,11 +208,11 @@ def _results_of(page: Page, env: str) -> Block:
         text = f"Scores are normalised by {by if own_runs else 'the reference returns'}."
     columns = ["method", *map(group_label, _groups(own))]
     table = _table(columns, lines, range(1, len(columns)))
-    return {"table": table, "texts": [text, *_unlike(page, env)]}
+    return {"table": table, "texts": [text, *_mismatches(page, env)]}
 
 
 def _results(page: Page) -> list[Block]:
-    blocks, remarks, lines = [], _unlike(page), []
+    blocks, remarks, lines = [], _mismatches(page), []
     if len(page.envs) > 1 and set(page.envs) == page.scored:
         unseen = page.parts[page.parts.group != TRAIN]
         for label in page.looks:
@@ -283,7 +283,7 @@ def _improvement(page: Page) -> Block:
     if not found:
         one = "There is one method only: nothing to compare."
         none = "No two methods were tested on the same unseen physics."
-        return {"texts": [one if len(labels) == 1 else none, *_unlike(page)]}
+        return {"texts": [one if len(labels) == 1 else none, *_mismatches(page)]}
     lines = [
         page.line(first, *(_estimate(found.get((first, second))) for second in labels))
         for first in labels
@@ -292,7 +292,7 @@ def _improvement(page: Page) -> Block:
     return {
         "table": _table(["", *labels], lines, range(1, len(labels) + 1)),
         "claims": [statistics.verdict(*pair) for pair in pairs],
-        "texts": [statistics.caution(min(e.num_runs for e in found.values())), *_unlike(page)],
+        "texts": [statistics.caution(min(e.num_runs for e in found.values())), *_mismatches(page)],
     }
 
 

@@ -142,7 +142,7 @@ def compare(parts: pd.DataFrame, first: str, second: str, value: str) -> Estimat
     """Probability that one label improves on another; None where nothing is common to them.
 
     A task is a group of physics in one environment; it counts where all runs of both were tested
-    on it, and alike (`unlike`).
+    on it, and alike (`mismatches`).
 
     Args:
         parts: Lines of `tables.by_physics` after the last iteration.
@@ -151,17 +151,19 @@ def compare(parts: pd.DataFrame, first: str, second: str, value: str) -> Estimat
         value: The column that is compared.
     """
     both = parts[parts.label.isin([first, second])]
-    strange = unlike(both)
+    differing = mismatches(both)
     pairs = []
     for env, tests in both.groupby("env"):
         groups = tests.groupby(["label", "run", "group"])[value].mean().unstack("group")
-        groups = groups[[g for g in groups if (env, g) not in strange and groups[g].notna().all()]]
+        groups = groups[
+            [g for g in groups if (env, g) not in differing and groups[g].notna().all()]
+        ]
         if groups.shape[1] and set(groups.index.get_level_values("label")) == {first, second}:
             pairs.append([groups.loc[label].to_numpy() for label in (first, second)])
     return improvement(*zip(*pairs, strict=True)) if pairs else None
 
 
-def unlike(parts: pd.DataFrame) -> list[tuple[str, str]]:
+def mismatches(parts: pd.DataFrame) -> list[tuple[str, str]]:
     """Environments and groups in which labels were tested with other physics or protocols."""
     places = (parts.protocol + " " + parts.sim_params).groupby(
         [parts.env, parts.group, parts.label], sort=False
