@@ -231,20 +231,20 @@ def verdicts(found: Found) -> list[str]:
     """
     reference = found.comparison.experiment.reference_arm.label
     parts = found.parts[found.parts.group != tables.TRAIN]
-    lines, counts, differing = [], [], []
+    lines, counts, apart = [], [], []
     for arm in found.comparison.experiment.arms:
         if arm.label == reference:
             continue
         both = parts[parts.label.isin([reference, arm.label])]
-        differing += [f"{arm.label} on {env}" for env in dict(mismatches(both))]
+        apart += [f"{arm.label} on {env}" for env in dict(mismatches(both))]
         shown = compare(parts, reference, arm.label, "return_mean")
         if shown is not None:
             lines.append(verdict(reference, arm.label, shown))
             counts += [shown.num_runs] * bool(shown.interval)
-    if differing:
+    if apart:
         lines.append(
             f"Not compared with {reference}, because physics, episode lengths or options of the"
-            f" environment differ: {'; '.join(differing)}."
+            f" environment differ: {'; '.join(apart)}."
         )
     return [*lines, *filter(None, [caution(min(counts))] if counts else [])]
 

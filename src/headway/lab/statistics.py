@@ -151,13 +151,11 @@ def compare(parts: pd.DataFrame, first: str, second: str, value: str) -> Estimat
         value: The column that is compared.
     """
     both = parts[parts.label.isin([first, second])]
-    differing = mismatches(both)
+    apart = mismatches(both)
     pairs = []
     for env, tests in both.groupby("env"):
         groups = tests.groupby(["label", "run", "group"])[value].mean().unstack("group")
-        groups = groups[
-            [g for g in groups if (env, g) not in differing and groups[g].notna().all()]
-        ]
+        groups = groups[[g for g in groups if (env, g) not in apart and groups[g].notna().all()]]
         if groups.shape[1] and set(groups.index.get_level_values("label")) == {first, second}:
             pairs.append([groups.loc[label].to_numpy() for label in (first, second)])
     return improvement(*zip(*pairs, strict=True)) if pairs else None
