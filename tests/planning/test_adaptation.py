@@ -82,7 +82,8 @@ def test_without_anything_to_learn_actions_are_those_of_frozen_heads():
     zero = even_prior(WRONG, ratio=0.0)
     frozen, _ = play(make_agent(adaptation="none"), 1.0, 4)
     learning_nothing, _ = play(make_agent(prior=zero), 1.0, 4)
-    np.testing.assert_array_equal(frozen.search.nominal, learning_nothing.search.nominal)
+    # With the flags of conftest.py XLA compiles the two programs to other last bits.
+    np.testing.assert_allclose(learning_nothing.search.nominal, frozen.search.nominal, atol=1e-6)
 
 
 @pytest.mark.parametrize("value", [1e4, 1e18, 1e30, np.inf, np.nan])

@@ -59,11 +59,15 @@ def transitions(count, num_envs=2, seed=0):
 
 
 @eqx.filter_jit
-def live(model, steps):
+def lived(model, steps, keys):
     belief = model.init_belief(len(steps[0].obs))
     for step in steps:
-        belief = model.observe(belief, step, KEYS)
+        belief = model.observe(belief, step, keys)
     return belief
+
+
+def live(model, steps):
+    return lived(model, steps, KEYS)
 
 
 @eqx.filter_jit
