@@ -5,6 +5,7 @@ Writes a figure (PNG, SVG), every episode's return (CSV) and a table with what c
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -39,12 +40,12 @@ class Found:
     files: Sequence[Path] = ()
     """Figure (PNG and SVG), raw numbers (CSV) and, last, the table (Markdown)."""
 
-    @property
+    @functools.cached_property
     def parts(self) -> pd.DataFrame:
         """Returns by physics (`tables.by_physics`) after the last iteration of each arm."""
         return tables.by_physics(_last(self.episodes))
 
-    @property
+    @functools.cached_property
     def points(self) -> pd.DataFrame:
         """Return on unseen physics, or while collecting, by run and iteration."""
         unseen = self.episodes[self.episodes.group != tables.TRAIN]
@@ -52,7 +53,7 @@ class Found:
         physics = unseen.groupby([*keys, "sim_params"], sort=False)["return"].mean()
         return physics.groupby(keys, sort=False).mean().reset_index()
 
-    @property
+    @functools.cached_property
     def last(self) -> pd.DataFrame:
         """The points after the last iteration of each arm: env, arm, seed, ..., value."""
         return _last(self.points).rename(columns={"label": "arm", "return": "value"})

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
@@ -126,7 +125,7 @@ def agent_policy(
 
     def choose(obs: Float[np.ndarray, "env obs"]) -> Choice:
         nonlocal state
-        state, decision = agent.act(state, jnp.asarray(obs, jnp.float32))
+        state, decision = agent.act(state, obs)
         return Choice(*jax.device_get((decision.action, decision.failures, decision.evaluations)))
 
     return choose
@@ -381,6 +380,5 @@ class Batches:
         return BadEnvironmentError(
             f"{len(self.reasons)} episodes broke, allowed: {self.allowed}"
             f" ({self.phase}.max_bad_episodes), and not all; the first: {self.reasons[0]}. Mend"
-            " the environment under these physics, or"
-            " allow more; then the same command goes on."
+            " the environment under these physics, or allow more; then the same command goes on."
         )
