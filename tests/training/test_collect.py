@@ -12,6 +12,7 @@ from headway import task
 from headway.errors import BadEnvironmentError
 from headway.sim_params import SimParamSets
 from headway.task import EnvSpec, register
+from headway.training.collect import Batches, Choice, Environments, Episode
 from headway.training.run import RunDir
 from headway.training.train import train_run
 from headway.worlds.classic import PendulumTask
@@ -113,6 +114,18 @@ def test_tests_that_break_stop_the_run_until_they_may_be_left_out(drift, sound, 
     settings = {**PROCESSES, "evaluation.max_bad_episodes": 1}
     again = headway.evaluate(run.path, groups=["far"], settings=settings)
     assert len(again) == config().evaluation.num_episodes - 1
+
+
+def test_plans_that_find_nothing_finite_are_said_once(drift):
+    said, episodes = [], [Episode({"drift": 0.5}, 0)]
+    failing = Choice(np.zeros((2, 1), np.float32), np.full(2, 2), np.zeros(2, int))
+    environments = Environments.make(config())
+    batches = Batches(environments, config(), "collection", lambda steps: None, said.append)
+    for name in ("first", "second"):
+        batches.run(name, episodes, lambda: lambda obs: failing)
+    assert [text.split(";")[0] for text in said] == [
+        "collection: 12 of 12 planner iterations found no finite return"
+    ]
 
 
 STOPS = [

@@ -343,6 +343,8 @@ class Batches:
     """Keeps finished batches, for when the process is killed."""
     reasons: list[str] = dataclasses.field(default_factory=list)
     """Why episodes were left out so far."""
+    failures: int = 0
+    """Planner iterations that found nothing finite so far."""
 
     @property
     def allowed(self) -> int:
@@ -371,6 +373,13 @@ class Batches:
             raise self.too_many()
         for reason in rollout.invalid.values():
             self.say(f"{reason}; the episode is dropped.")
+        if rollout.use.failures and not self.failures:
+            tried = rollout.use.steps * self.config.planner.num_iterations
+            self.say(
+                f"{self.phase}: {rollout.use.failures} of {tried} planner iterations found"
+                " no finite return; actions follow older plans or are 0. Check the Task's reward."
+            )
+        self.failures += rollout.use.failures
         if self.partial and kept is None and rollout.episodes:
             self.partial.save(name, *rollout.to_part())
         return rollout
