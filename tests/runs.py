@@ -22,6 +22,11 @@ def tiny_config(env="pendulum", method="tmcl", seed=0, **changes):
     return make_config(env, method=method, preset="smoke", seed=seed, settings=settings)
 
 
+def random_config(seed=0, **settings):
+    """A run that learns nothing, so that nothing is compiled."""
+    return make_config("pendulum", method="random", preset="smoke", seed=seed, settings=settings)
+
+
 class Listening(Progress):
     """Remembers what was said."""
 

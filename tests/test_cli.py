@@ -198,14 +198,17 @@ def test_train_json_is_one_line(capsys, calls, tmp_path):
 
 def test_evaluate_passes_groups_episodes_and_the_settings_that_differ(capsys, calls, trained):
     words = "--group unseen train --episodes 5 --planner.num-candidates 50 --planner.horizon 20"
+    words += " --sim-params length=2.0 mass=1 --iteration best"
     code, out, _ = run(capsys, "evaluate", trained, *words.split(), "--json")
     assert code == 0
     call, facts = calls[0], json.loads(out)
     assert (call["run_dir"], call["groups"]) == (trained, ("unseen", "train"))
     assert (call["num_episodes"], call["settings"]) == (5, {"planner.num_candidates": 50})
+    assert (call["sim_params"], call["iteration"]) == ({"length": 2.0, "mass": 1.0}, "best")
     assert facts["settings"] == call["settings"]
     assert facts["planning"] == dataclasses.asdict(PlanningCost(300.0, 2.5e9, 0.0125))
-    out = run(capsys, "evaluate", trained)[1]
+    out = run(capsys, "evaluate", trained, "--iteration", "1")[1]
+    assert calls[1]["iteration"] == 1
     assert "Planning took 300 candidates, 2.5 GFLOP, 12.5 ms per step." in out
     assert (calls[1]["groups"], calls[1]["num_episodes"], calls[1]["settings"]) == (None, None, {})
 

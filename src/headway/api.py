@@ -11,8 +11,8 @@ from headway.planning.controller import Controller
 from headway.training.evaluate import returns_in_words
 from headway.training.methods import config_to_evaluate, make_config
 from headway.training.progress import Progress
-from headway.training.run import EpisodeRow, RunDir
-from headway.training.train import train_run
+from headway.training.run import EpisodeRow, Iteration, RunDir
+from headway.training.train import OnIteration, train_run
 from headway.training.trainers import load_agent
 
 
@@ -56,8 +56,11 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
     settings: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
     resume_from_last_good: bool = False,
+    on_iteration: OnIteration | None = None,
 ) -> Run:
     """Train a controller on environments whose physics vary; resume if it was begun before.
+
+    A finished run goes on where `collection.num_iterations` is larger than before.
 
     Args:
         env: Short name or id of an environment.
@@ -69,6 +72,9 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
         progress: Shown while training; silent by default.
         resume_from_last_good: Where a file of the run is damaged, go back to the newest
             iteration whose files are all intact.
+        on_iteration: Called with each iteration's line of `metrics.jsonl` (a dict) once it is
+            saved, for a tracker of experiments. What it raises ends the run; the same command goes
+            on with the next iteration.
 
     Raises:
         UnknownNameError: No such environment, method or preset.
@@ -80,8 +86,10 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
     """
     prepare_jax()
     config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
-    usual = Path("runs") / f"{config.env}-{method}-{preset}-seed{seed}"
-    run = train_run(config, run_dir or usual, progress, resume_from_last_good=resume_from_last_good)
+    path = run_dir or Path("runs") / f"{config.env}-{method}-{preset}-seed{seed}"
+    run = train_run(
+        config, path, progress, on_iteration, resume_from_last_good=resume_from_last_good
+    )
     return Run(run.path, config, run.metrics(), run.evaluation())
 
 
@@ -89,6 +97,7 @@ def load(
     run_dir: str | Path,
     *,
     seed: int = 0,
+    iteration: Iteration = None,
     settings: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Controller:
@@ -97,16 +106,18 @@ def load(
     Args:
         run_dir: The run directory.
         seed: Seeds the planner's draws.
+        iteration: The iteration whose model acts, from 0, or `"best"`: the kept one whose
+            controller collected the highest mean return. The newest by default.
         settings: Changes of `planner` settings by dotted name, for example
             `{"planner.num_candidates": 50}`, to control with another planner.
         options: Those of `Controller`, for example `deadline_ms=50`.
 
     Raises:
-        RunError: There is no trained run, or it is damaged.
+        RunError: There is no trained run, it does not keep the iteration, or it is damaged.
         ConfigError: A setting is unknown, of the wrong type or out of range, or none of the
             planner's; or as `Controller`.
     """
     prepare_jax()
     run = RunDir(run_dir)
     config = config_to_evaluate(run.config(), settings or {}, ("planner",))
-    return Controller(load_agent(run, config), seed=seed, **options)
+    return Controller(load_agent(run, config, iteration=iteration), seed=seed, **options)

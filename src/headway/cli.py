@@ -50,6 +50,9 @@ def _unless_given(text: str):
     return tyro.conf.arg(help_behavior_hint=f"(default: {text})")
 
 
+Iteration = Annotated[int | Literal["best"] | None, _unless_given("the newest")]
+
+
 @dataclasses.dataclass(frozen=True)
 class Names:
     """The words of a line that say whose settings are the defaults of all others."""
@@ -250,6 +253,10 @@ class Evaluate(_OfRun):
     """Groups of physics: `train` or unseen groups."""
     episodes: Annotated[int | None, _unless_given("as in the run's own tests")] = None
     """Episodes per group; the same as --evaluation.num-episodes."""
+    sim_params: Annotated[tuple[str, ...], _unless_given("none")] = ()
+    """Physics that are in no group, for example length=2.0."""
+    iteration: Iteration = None
+    """The iteration whose model is tested, from 0, or `best` by training return."""
     evaluation: EvaluationConfig = EvaluationConfig()
 
     def run(self, words):
@@ -262,6 +269,8 @@ class Evaluate(_OfRun):
             self.run_dir,
             groups=self.group or None,
             num_episodes=self.episodes,
+            sim_params=_physics(self.sim_params, "--sim-params"),
+            iteration=self.iteration,
             settings=settings,
             progress=self.progress(),
         )
@@ -296,6 +305,8 @@ class Record(_OfRun):
     """Seeds the start and the planner."""
     steps: Annotated[int | None, _unless_given("a full episode")] = None
     """Steps to film."""
+    iteration: Iteration = None
+    """The iteration whose model acts, from 0, or `best` by training return."""
 
     def run(self, words):
         """Film, and print where the film is."""
@@ -320,6 +331,7 @@ class Record(_OfRun):
             schedule=schedule,
             seed=self.seed,
             num_steps=self.steps,
+            iteration=self.iteration,
             settings=settings,
             progress=self.progress(),
         )

@@ -405,6 +405,8 @@ class CollectionConfig:
     hangs or crashes costs its episode only; slower where steps are quick."""
     step_timeout_s: Annotated[float, Field(strict=True, ge=1e-3, le=1e6)] = 60.0
     """Seconds that a step or reset may take before its process is given up (env_processes)."""
+    num_checkpoints: Annotated[int, Field(strict=True, ge=2, le=LARGEST)] = 2
+    """Newest iterations that can be loaded; the best one is kept as well."""
 
 
 @settings
@@ -490,10 +492,11 @@ TOLERANCE = (
     "collection.max_bad_episodes",
     "collection.env_processes",
     "collection.step_timeout_s",
+    "collection.num_checkpoints",
     "evaluation.max_bad_episodes",
 )
-"""Settings about environments that break; the numbers of sound episodes do not depend on it,
-so a run may go on with other values."""
+"""Settings about environments that break, and checkpoints; the numbers of sound episodes do not
+depend on it, so a run may go on with other values."""
 
 
 def to_dict(config: Config) -> dict[str, Any]:

@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 
+import runs
 from headway.config import to_dict
 from headway.errors import DivergenceError
 from headway.lab.paper import experiment
@@ -20,9 +21,7 @@ DIVERGED = DivergenceError("no finite number")
 
 
 def random_job(out, seed=0, **settings):
-    """A run that learns nothing, so that nothing is compiled."""
-    names = {"method": "random", "preset": "smoke", "seed": seed}
-    return Job.of(make_config("pendulum", **names, settings=settings), out)
+    return Job.of(runs.random_config(seed, **settings), out)
 
 
 def comparison(out, name="fig13", envs=("pendulum",), seeds=(0,), preset="smoke", **settings):

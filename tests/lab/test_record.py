@@ -96,7 +96,7 @@ def test_without_heads_there_are_no_strips():
 def run_dir(tmp_path, monkeypatch):
     """A run whose agent acts at random."""
     monkeypatch.setattr(
-        lab, "load_agent", lambda run, config: Agent(None, task_of(config), PlannerConfig())
+        lab, "load_agent", lambda run, config, **_: Agent(None, task_of(config), PlannerConfig())
     )
     run = RunDir(tmp_path / "run")
     run.begin(make_config("pendulum", preset="smoke"))

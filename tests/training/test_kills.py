@@ -7,6 +7,7 @@ import contextlib
 import errno
 import functools
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import numpy as np
 import pytest
 
 import runs
-from headway.errors import BadEnvironmentError, LimitError
+from headway.errors import BadEnvironmentError, LimitError, RunError
 from headway.training import train
 from headway.training.methods import make_config
 from headway.training.progress import Progress
@@ -63,13 +64,13 @@ def pulled(plain, places, *args, **named):
     return done
 
 
-def train_until(places, path, monkeypatch, every=NEVER):
+def train_until(places, path, monkeypatch, every=NEVER, config=None):
     """Train with a kill, or a full disk, wherever `places` says; returns the number of places."""
     with monkeypatch.context() as patch:
         for name in ("fsync", "replace", "unlink"):
             patch.setattr(os, name, functools.partial(pulled, getattr(os, name), places))
         patch.setattr(train, "SAVE_EVERY", every)
-        train.train_run(runs.tiny_config(), path, places)
+        train.train_run(config or runs.tiny_config(), path, places)
     return places.count
 
 
@@ -93,6 +94,21 @@ def test_kills_change_nothing(seed, reference, tmp_path, monkeypatch):
         train.train_run(runs.tiny_config(), path)
         assert runs.result(path) == runs.result(reference)
     assert kills > 3
+
+
+def test_a_finished_run_goes_on_to_more_iterations_wherever_it_is_killed(tmp_path, monkeypatch):
+    short, longer = (runs.random_config(**{"collection.num_iterations": n}) for n in (1, 2))
+    train.train_run(short, tmp_path / "short")
+    train.train_run(longer, shutil.copytree(tmp_path / "short", tmp_path / "whole"))
+    for place in range(3, 15, 3):  # before, between and after its two files are replaced
+        path = shutil.copytree(tmp_path / "short", tmp_path / f"run-{place}")
+        with pytest.raises(Killed):
+            train_until(Places(place), path, monkeypatch, config=longer)
+        run = train.train_run(longer, path)
+        assert run.config() == longer
+        assert runs.result(path) == runs.result(tmp_path / "whole")
+    with pytest.raises(RunError, match=r"collection\.num_iterations: 2 -> 1"):
+        train.train_run(short, path)
 
 
 @pytest.mark.parametrize("place", [1, 2, 40, 150])

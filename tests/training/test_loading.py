@@ -1,4 +1,4 @@
-"""Acting from a run: another planner, heads that learn, a copy that lacks files, no simulator."""
+"""Acting from a run: any iteration, another planner, learning heads, a copy that lacks files."""
 
 import shutil
 import subprocess
@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import headway
+import runs
+import toys
 from headway.errors import ConfigError, RunError
 from headway.training.methods import config_to_evaluate
 from headway.training.run import RunDir
@@ -46,6 +48,26 @@ def test_the_prior_of_a_loaded_agent_comes_from_all_its_data(two_iterations):
     part = trainer.agent(trainer.load(run), run.load_data()[:1])
     assert (part.model.prior.noise != agent.model.prior.noise).all()
     assert load_agent(run).model.prior is None
+
+
+def test_an_earlier_iteration_acts_as_it_did_then(reference, two_iterations):
+    found, then = (
+        headway.load(path, iteration=1, settings=LAST_LAYER).agent.model
+        for path in (reference, two_iterations)
+    )
+    toys.assert_equal(found, then)
+
+
+def test_the_newest_iterations_and_the_best_are_kept(tmp_path):
+    run = RunDir(tmp_path)
+    run.begin(runs.tiny_config(**{"collection.num_checkpoints": 3}))
+    for i, collected in enumerate([99.0, 5.0, 9.0, 1.0, 2.0, 3.0, 4.0]):
+        metrics = {"iteration": i, "collection": {"return_mean": collected}}
+        run.save_iteration(metrics, (), [], {}, {})
+    run.begin(runs.tiny_config())
+    assert [run.kept_iteration(wanted) for wanted in (None, "best", 5)] == [6, 1, 5]
+    with pytest.raises(RunError, match="keeps no iteration 2, allowed: 1, 4, 5, 6; "):
+        run.kept_iteration(2)
 
 
 SERVED = ("config.json", "checksums/iteration-001.json", "checkpoints/iteration-001.safetensors")

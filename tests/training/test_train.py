@@ -7,7 +7,7 @@ import pytest
 import headway
 import runs
 from headway.data import Trajectory
-from headway.errors import DivergenceError, UnknownNameError
+from headway.errors import ConfigError, DivergenceError, UnknownNameError
 from headway.models.fitting import EpochStats
 from headway.training import train
 from headway.training.collect import Environments
@@ -45,6 +45,56 @@ def test_environments_are_closed_where_nothing_comes_of_a_run(root, monkeypatch)
         headway.evaluate(root, groups=["highest"])
     train.train_run(runs.tiny_config(), root)
     assert len(made) == len(closed) == 3
+
+
+def rows_of(rows, groups, iteration):
+    found = [row.to_csv() for row in rows if row.group in groups and row.iteration == iteration]
+    return sorted(found, key=str)
+
+
+@pytest.mark.parametrize(
+    ("random", "groups", "iteration"),
+    [(False, None, None), (False, ["high", "low"], 1), (True, ["low"], None)],
+)
+def test_a_runs_own_tests_give_their_numbers_again(random, groups, iteration, reference, tmp_path):
+    run = RunDir(reference)
+    if random:
+        own = runs.random_config(**{"evaluation.num_episodes": 3})  # groups share batches
+        run = train.train_run(own, tmp_path / "run")
+    heard, number = runs.Listening(), run.kept_iteration(iteration)
+    found = headway.evaluate(run.path, groups=groups, iteration=iteration, progress=heard)
+    tested = groups or ["train", "low", "high"]
+    assert rows_of(found, tested, number) == rows_of(run.evaluation(), tested, number)
+    assert len(found) == len(tested) * run.config().evaluation.num_episodes
+    assert not heard.said
+
+
+def test_new_draws_are_said_and_physics_need_no_group(reference):
+    heard = runs.Listening()
+    asked = {"groups": ["low"], "progress": heard}
+    found = headway.evaluate(reference, sim_params={"length": 2.0}, **asked)
+    assert rows_of(found, ["low"], 2) == rows_of(RunDir(reference).evaluation(), ["low"], 2)
+    custom = [(row.sim_params["length"], row.group) for row in found[2:]]
+    assert custom == [(2.0, "custom")] * 2
+    headway.evaluate(reference, num_episodes=1, **asked)
+    says = "New draws, not those of iteration 2's tests"
+    reasons = ("custom was not tested", "evaluation.num_episodes: 2 -> 1")
+    assert heard.said == [f"{says}: {reason}." for reason in reasons]
+    with pytest.raises(ConfigError, match=r"group 'custom' has .*lenth, allowed"):
+        headway.evaluate(reference, sim_params={"lenth": 2.0})
+
+
+def test_each_iteration_is_told_once_it_counts(tmp_path):
+    told = []
+
+    def fail(metrics):
+        told.append(metrics)
+        raise ZeroDivisionError
+
+    config = runs.random_config(**{"collection.num_iterations": 2})
+    with pytest.raises(ZeroDivisionError):
+        train.train_run(config, tmp_path / "run", None, fail)
+    assert told == train.train_run(config, tmp_path / "run", None, told.append).metrics()
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from headway.task import env_options, episode_length
 from headway.training.files import write_bytes
 from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
-from headway.training.run import RunDir
+from headway.training.run import Iteration, RunDir
 from headway.training.trainers import load_agent
 
 FORMATS = (".gif", ".mp4")
@@ -66,6 +66,7 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
     schedule: Schedule | None = None,
     seed: int = 0,
     num_steps: int | None = None,
+    iteration: Iteration = None,
     settings: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Recording:
@@ -82,11 +83,12 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
         schedule: Physics that change during the episode, by step.
         seed: Seeds the start and the planner's draws.
         num_steps: Steps to film; a full episode by default.
+        iteration: The iteration whose model acts, as in `headway.load`; the newest by default.
         settings: Changes of `planner` settings by dotted name, as in `headway.evaluate`.
         progress: Shown while acting; silent by default.
 
     Raises:
-        RunError: There is no trained run, or it is damaged.
+        RunError: There is no trained run, it does not keep the iteration, or it is damaged.
         ConfigError: The ending, a simulator parameter, a step or a setting is not allowed.
         BadEnvironmentError: The environment cannot be drawn.
     """
@@ -97,7 +99,7 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
         raise ConfigError(f"num_steps is {num_steps}, allowed: at least 1.")
     run = RunDir(run_dir)
     config = config_to_evaluate(run.config(), settings or {})
-    controller = Controller(load_agent(run, config), seed=seed)
+    controller = Controller(load_agent(run, config, iteration=iteration), seed=seed)
     length = num_steps or episode_length(config)
     own = {"sim_params": config.sim_params} if config.sim_params else {}
     made = make(config.env, render_mode="rgb_array", **env_options(config), **own)

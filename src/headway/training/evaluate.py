@@ -10,21 +10,24 @@ from typing import Any
 import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
+from numpy.typing import ArrayLike
 
-from headway.config import Config
+from headway.config import Config, differences, override, tolerating_as
 from headway.data import Trajectory
 from headway.errors import unknown_name
 from headway.models.compilation import prepare_jax
 from headway.planning.agent import Agent
 from headway.planning.rollouts import plan_flop
 from headway.sim_params import SimParamSets
+from headway.task import sim_param_sets
 from headway.training.collect import Batches, Environments, Episode, PlannerUse, agent_policy
 from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
-from headway.training.run import EpisodeRow, RunDir, format_sim_params
+from headway.training.run import EpisodeRow, Iteration, RunDir, format_sim_params
 from headway.training.trainers import load_agent
 
 GROUP_SEEDS = 1000  # seeds reserved for each group, so that groups never share an episode
+CUSTOM = "custom"  # group of physics that an evaluation names itself
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,12 +125,23 @@ def group_episodes(
     return [Episode(each, first + i) for i, each in enumerate(physics)]
 
 
-def run_tests(agent: Agent, groups: Sequence[str], batches: Batches, key: PRNGKeyArray) -> Tests:
+def iteration_keys(config: Config, iteration: int) -> PRNGKeyArray:
+    """Keys of an iteration's collection, fit, tests and errors.
+
+    They come from seed and iteration alone, however often the run was interrupted before.
+    """
+    return jax.random.split(jax.random.fold_in(jax.random.key(config.seed), iteration + 1), 4)
+
+
+def run_tests(
+    agent: Agent, wanted: Sequence[str], groups: Sequence[str], batches: Batches, key: PRNGKeyArray
+) -> Tests:
     """Run the test episodes of some groups, as many side by side as a batch holds.
 
     Args:
         agent: The agent to test.
-        groups: `train` or unseen groups.
+        wanted: The groups to test on.
+        groups: The same or more, in the order that decides which draws an episode gets.
         batches: Runs them.
         key: The planner's draws.
 
@@ -143,17 +157,22 @@ def run_tests(agent: Agent, groups: Sequence[str], batches: Batches, key: PRNGKe
             group_episodes(environments.sim_params, group, evaluation.num_episodes, evaluation.seed)
         )
     ]
-    found: dict[str, dict[int, Trajectory]] = {group: {} for group in groups}
+    found: dict[str, dict[int, Trajectory]] = {group: {} for group in wanted}
     use, seconds = PlannerUse(), 0.0
     for chunk, start in enumerate(range(0, len(asked), size)):
-        batch = asked[start : start + size]
-        episodes, chunk_key = [episode for *_, episode in batch], jax.random.fold_in(key, chunk)
+        batch, chunk_key = asked[start : start + size], jax.random.fold_in(key, chunk)
+        ours = [episode for group, _, episode in batch if group in wanted]
+        if not ours:
+            continue
+        # Every place has draws of its own, so the episodes that are wanted keep theirs.
+        episodes = [episode if group in wanted else ours[0] for group, _, episode in batch]
         policy = partial(agent_policy, agent, size, episodes, key=chunk_key)
         rollout = batches.run(f"evaluate-{chunk}", episodes, policy)
         use, seconds = use + rollout.use, seconds + rollout.seconds
         for place, trajectory in rollout.episodes.items():
             group, number, _ = batch[place]
-            found[group][number] = trajectory
+            if group in wanted:
+                found[group][number] = trajectory
     if not all(found.values()):
         if batches.partial:  # when the environment is mended, they are run again
             batches.partial.remove("evaluate-*")
@@ -166,37 +185,61 @@ def evaluate(
     *,
     groups: Sequence[str] | None = None,
     num_episodes: int | None = None,
+    sim_params: Mapping[str, ArrayLike] | None = None,
+    iteration: Iteration = None,
     settings: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Evaluation:
     """Test a trained run once more, with its protocol; nothing in its directory changes.
 
+    Where no setting is changed, groups that the run was tested on after this iteration give its
+    own numbers again, bit for bit on the same machine. Else the planner's draws are new, which
+    `progress` says.
+
     Args:
         run_dir: The run directory.
         groups: `"train"` or unseen groups; all of them by default.
         num_episodes: Episodes per group; the run's own number by default.
+        sim_params: Physics that are in no group, a value or several of each parameter; those that
+            are not named go through the training values. They are tested as the group `custom`,
+            alone or beside `groups`.
+        iteration: The iteration whose model is tested, from 0, or `"best"` by training return; the
+            newest by default.
         settings: Changes of `planner` and `evaluation` settings by dotted name, for example
             `{"planner.num_candidates": 50}`, to test the model with another planner.
         progress: Shown while testing; silent by default.
 
     Raises:
-        RunError: There is no trained run, or it is damaged.
+        RunError: There is no trained run, it does not keep the iteration, or it is damaged.
         UnknownNameError: No such group.
         ConfigError: A setting is unknown, of the wrong type or out of range, or one that
-            training has fixed.
+            training has fixed; or a simulator parameter is unknown or no number.
     """
     prepare_jax()
     run, changes = RunDir(run_dir), dict(settings or {})
     if num_episodes is not None:
         changes["evaluation.num_episodes"] = num_episodes
     config = config_to_evaluate(run.config(), changes)
+    changed = differences(tolerating_as(run.config(), config), config)
+    number = run.kept_iteration(iteration)
+    tested = [row.group for row in run.evaluation() if row.iteration == number]
+    if sim_params:
+        sets = sim_param_sets(config)
+        custom = {**sets.train, **{name: np.atleast_1d(v) for name, v in sim_params.items()}}
+        physics = {"train": sets.train, "unseen": {**sets.unseen, CUSTOM: custom}}
+        config, groups = override(config, {"sim_params": physics}), [*(groups or ()), CUSTOM]
     with closing(Environments.make(config)) as environments, progress or Progress() as shown:
-        agent = load_agent(run, config, environments)
-        groups = known_groups(groups, environments.sim_params.group_names)
-        total = len(groups) * config.evaluation.num_episodes * environments.episode_length
+        agent = load_agent(run, config, environments, number)
+        known = environments.sim_params.group_names
+        wanted = known_groups(groups, known)
+        if new := changed or [f"{group} was not tested" for group in wanted if group not in tested]:
+            shown.message(f"New draws, not those of iteration {number}'s tests: {'; '.join(new)}.")
+        total = len(wanted) * config.evaluation.num_episodes * environments.episode_length
         shown.phase("evaluate", total)
         batches = Batches(environments, config, "evaluation", shown.advance, shown.message)
-        tests = run_tests(agent, groups, batches, jax.random.key(config.evaluation.seed))
+        seed = config.evaluation.seed
+        key = jax.random.key(seed) if changed else iteration_keys(config, number)[2]
+        tests = run_tests(agent, wanted, list(dict.fromkeys([*tested, *known])), batches, key)
     use = tests.use
     evaluations = use.evaluations / use.steps
     cost = PlanningCost(
@@ -204,7 +247,7 @@ def evaluate(
         plan_flop(config.model, config.planner, environments.task, evaluations),
         use.seconds / use.timed_steps if use.timed_steps else None,
     )
-    rows = tests.rows(config, run.last_iteration)
+    rows = tests.rows(config, number)
     return Evaluation(rows, config, cost, tests.trajectories)
 
 

@@ -6,7 +6,7 @@
     assignments.csv                         share of segments that each head owns, by physics
     prediction_error.csv                    error by imagined step
     data/iteration-000.safetensors          episodes that an iteration collected
-    tests/iteration-000.safetensors         its test episodes; kept for two iterations
+    tests/iteration-000.safetensors         its test episodes; of the newest, and of the best
     checkpoints/iteration-000.safetensors   weights, optimiser, normalisers; likewise
     checksums/iteration-000.json            of all files it stands on; written last, makes it count
     partial/                                what is done of the unfinished iteration
@@ -27,15 +27,15 @@ import platform
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import filelock
 import jax
 import numpy as np
 
-from headway.config import Config, differences, from_dict, to_dict, tolerating_as
+from headway.config import Config, differences, from_dict, override, to_dict, tolerating_as
 from headway.data import Trajectory
-from headway.errors import BusyError, RunError
+from headway.errors import BusyError, RunError, shown
 from headway.training.files import (
     UNFINISHED,
     Arrays,
@@ -52,8 +52,11 @@ from headway.training.files import (
     writing,
 )
 
+Iteration = int | Literal["best"] | None
+"""An iteration, from 0; the one whose model collected the highest mean return; or the newest."""
+
 SCHEMA = 3  # of a run directory
-KEPT = 2  # iterations whose checkpoints and tests stay, so that there is one to go back to
+KEPT = 2  # newest iterations whose checkpoints and tests stay, unless settings say more
 LOCK = ".lock"
 VERSIONED = ("headway", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco")
 TABLES = {
@@ -122,6 +125,7 @@ class RunDir:
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
+        self._num_checkpoints = KEPT
 
     @property
     def figures(self) -> Path:
@@ -165,7 +169,7 @@ class RunDir:
     def begin(self, config: Config) -> None:
         """Begin a run here, or make sure that the run here is the same; call it when `locked`.
 
-        What it tolerates of its environments may differ (`config.TOLERANCE`).
+        What does not change its numbers may differ (`config.TOLERANCE`), and it may become longer.
 
         Raises:
             RunError: The directory holds a run with other settings, or a damaged one; the
@@ -181,13 +185,20 @@ class RunDir:
                 "commit": _commit(),
             }
             write_json(self.path / "config.json", values)
-        found = differences(tolerating_as(self.config(), config), config)
+        begun, wanted = tolerating_as(self.config(), config), config.collection.num_iterations
+        if longer := wanted > begun.collection.num_iterations:
+            begun = override(begun, {"collection.num_iterations": wanted})
+        found = differences(begun, config)
         if found:
             raise RunError(
-                f"{self.path} holds a run with other settings ({'; '.join(found)}); choose"
-                " another --run-dir, or the same settings to resume."
+                f"{self.path} holds a run with other settings ({'; '.join(found)}); choose another"
+                " --run-dir, or the same settings to resume, perhaps with more iterations."
             )
+        if longer:
+            self._lengthen(wanted)
         self.check()
+        settings = self.config(), config  # what the run was begun to keep is not deleted later
+        self._num_checkpoints = max(each.collection.num_checkpoints for each in settings)
         self._tidy()
 
     def config(self) -> Config:
@@ -229,6 +240,27 @@ class RunDir:
                 " on training it with the same `headway train` command, or complete the copy."
             )
         return finished - 1
+
+    def kept_iteration(self, wanted: Iteration = None) -> int:
+        """The number of an iteration that can be loaded.
+
+        Args:
+            wanted: Its number from 0; `"best"`, the one whose model earned the highest mean return
+                when it collected, which the newest has not done yet; or None, the newest.
+
+        Raises:
+            RunError: It is not kept, or nothing is.
+        """
+        last, kept = self.last_iteration, self._kept()
+        if wanted is None:
+            return last
+        found = self._best() if wanted == "best" else wanted
+        if found not in kept:
+            raise RunError(
+                f"{self.path} keeps no iteration {shown(wanted)}, allowed:"
+                f" {', '.join(map(str, kept))}; collection.num_checkpoints keeps more in training."
+            )
+        return kept[kept.index(found)]
 
     def check(self) -> None:
         """Compare all files of the newest iteration with their checksums.
@@ -272,17 +304,19 @@ class RunDir:
         """Error by imagined step, per iteration and group."""
         return self._rows("prediction_error.csv")
 
-    def load_checkpoint(self, template: Tree) -> Tree:
-        """Read what was learned up to the newest iteration.
+    def load_checkpoint(self, template: Tree, iteration: Iteration = None) -> Tree:
+        """Read what was learned up to an iteration.
 
         Args:
             template: A pytree of arrays or shapes with the same structure.
+            iteration: As `kept_iteration`.
 
         Raises:
-            RunError: No iteration is finished, or the checkpoint is damaged or of another model.
+            RunError: It is not kept, or the checkpoint is damaged or of another model.
         """
-        name = _name("checkpoints", self.last_iteration)
-        self._read(["config.json", name])
+        number = self.kept_iteration(iteration)
+        name = _name("checkpoints", number)
+        self._read(["config.json", name], number)
         return tree_from_arrays(template, load_arrays(self.path / name)[0], self.path / name)
 
     def iteration_data(self, iteration: int) -> list[Trajectory]:
@@ -296,9 +330,10 @@ class RunDir:
         with reading(path):
             return trajectories_from(arrays, facts)
 
-    def load_data(self) -> list[Trajectory]:
-        """All trajectories that the finished iterations collected."""
-        return [t for i in range(self.finished_iterations) for t in self.iteration_data(i)]
+    def load_data(self, until: int | None = None) -> list[Trajectory]:
+        """All trajectories that were collected up to an iteration, the newest by default."""
+        finished = self.finished_iterations if until is None else until + 1
+        return [t for i in range(finished) for t in self.iteration_data(i)]
 
     def tests(self) -> dict[str, list[Trajectory]]:
         """The test episodes of the newest iteration by group; empty if there were none.
@@ -409,6 +444,26 @@ class RunDir:
         stems = [path.stem for path in (self.path / folder).glob("iteration-*")]
         return sorted(int(stem[10:]) for stem in stems if stem[10:].isdigit())
 
+    def _lengthen(self, num_iterations: int) -> None:
+        """Change `collection.num_iterations`; `begin` does it again if it was interrupted."""
+        values = json.loads((self.path / "config.json").read_bytes())
+        values["config"]["collection"]["num_iterations"] = num_iterations
+        content = json.dumps(values, indent=2).encode()
+        for iteration in self._numbers("checksums"):  # first, since `begin` looks at the settings
+            checksums = self._checksums(iteration) | {"config.json": _digest(content)}
+            write_json(self.path / _name("checksums", iteration), checksums)
+        write_bytes(self.path / "config.json", content)
+
+    def _kept(self) -> list[int]:
+        return sorted({*self._numbers("checkpoints")} & {*self._numbers("checksums")})
+
+    def _best(self) -> int | None:
+        """The kept iteration that earned most; None where none has collected."""
+        # An iteration collects with what the one before it has learned.
+        collected = {row["iteration"] - 1: row.get("collection") for row in self.metrics()}
+        judged = [iteration for iteration in self._kept() if collected.get(iteration)]
+        return max(judged, key=lambda i: collected[i]["return_mean"], default=None)
+
     def _checksums(self, iteration: int) -> dict[str, Any]:
         if iteration < 0:
             return {}
@@ -416,18 +471,20 @@ class RunDir:
         with reading(path):
             return dict(json.loads(path.read_bytes()))
 
-    def _read(self, names: Sequence[str] | None = None) -> dict[str, bytes]:
-        """The parts of files that count for the newest iteration, as they were written.
+    def _read(self, names: Sequence[str] = (), iteration: int | None = None) -> dict[str, bytes]:
+        """The parts of files that count for an iteration, as they were written.
 
         Args:
             names: Of the files; all that there are by default.
+            iteration: The newest by default.
 
         Raises:
             RunError: One is damaged or gone; the message says how to go back.
         """
         try:
-            known = self._checksums(self.finished_iterations - 1)
-            for name in names or ():
+            newest = self.finished_iterations - 1
+            known = self._checksums(newest if iteration is None else iteration)
+            for name in names:
                 if name not in known:
                     raise RunError(f"{self.path / name} is not among the run's checksums.")
             return {name: _checked(self.path / name, known[name]) for name in names or known}
@@ -456,9 +513,10 @@ class RunDir:
     def _tidy(self) -> None:
         """Delete what nobody goes back to, and files that were never complete."""
         last = self.finished_iterations - 1
+        kept = {self._best(), *range(last + 1 - self._num_checkpoints, last + 2)}
         for folder in ("checksums", "checkpoints", "tests"):
             for iteration in self._numbers(folder):
-                if last >= 0 and not last - KEPT < iteration <= last + 1:
+                if last >= 0 and iteration not in kept:
                     remove(self.path / _name(folder, iteration))
         for path in self.path.rglob(f".*{UNFINISHED}"):
             remove(path)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Literal
@@ -24,7 +24,7 @@ from headway.training.collect import (
     agent_policy,
     random_policy,
 )
-from headway.training.evaluate import Tests, run_tests
+from headway.training.evaluate import Tests, iteration_keys, run_tests
 from headway.training.files import tree_arrays, tree_from_arrays
 from headway.training.progress import Progress
 from headway.training.run import RunDir
@@ -42,10 +42,15 @@ MANY_MAPS = 30_000
 """Half of the memory maps that Linux allows a process."""
 
 
+OnIteration = Callable[[dict[str, Any]], Any]
+"""Called with the line of `metrics.jsonl` of each iteration, once that counts."""
+
+
 def train_run(
     config: Config,
     run_dir: str | Path,
     progress: Progress | None = None,
+    on_iteration: OnIteration | None = None,
     *,
     resume_from_last_good: bool = False,
 ) -> RunDir:
@@ -56,8 +61,9 @@ def train_run(
 
     Args:
         config: All settings.
-        run_dir: A new directory, or one with the same settings.
+        run_dir: A new directory, or one with the same settings and as many iterations at most.
         progress: Shown while training; silent by default.
+        on_iteration: Called after each iteration; what it raises ends the run.
         resume_from_last_good: Where a file is damaged, forget the iterations that stand on it.
 
     Raises:
@@ -82,7 +88,7 @@ def train_run(
             )
         with closing(Environments.make(config)) as environments:
             run.begin(config)
-            _Training(config, run, environments, shown, stop).train()
+            _Training(config, run, environments, shown, stop, on_iteration).train()
     return run
 
 
@@ -96,6 +102,7 @@ class _Training:
     environments: Environments
     progress: Progress
     stop: StopRequest
+    on_iteration: OnIteration | None
 
     def __post_init__(self):
         learns, begun = self.config.model.learns, self.run.finished_iterations > 0
@@ -108,9 +115,7 @@ class _Training:
         config, run, trainer = self.config, self.run, self.trainer
         for iteration in range(run.finished_iterations, config.collection.num_iterations):
             self.iteration, self.partial = iteration, run.partial()
-            # From seed and iteration alone, however often the run was interrupted before.
-            key = jax.random.fold_in(jax.random.key(config.seed), iteration + 1)
-            collect_key, fit_key, test_key, error_key = jax.random.split(key, 4)
+            collect_key, fit_key, test_key, error_key = iteration_keys(config, iteration)
             metrics: dict[str, Any] = {"iteration": iteration}
             collected: list[Trajectory] = []
             seconds = {}
@@ -147,6 +152,8 @@ class _Training:
             run.save_iteration(metrics, self.state, collected, tested, tables)
             self.partial.remove()
             self.progress.iteration_done(metrics)
+            if self.on_iteration:
+                self.on_iteration(metrics)
             self.stop.answer()
         run.partial().remove()
 
@@ -272,7 +279,7 @@ class _Training:
         num_tests = len(groups) * self.config.evaluation.num_episodes
         self.begin_phase("evaluate", num_tests * self.environments.episode_length)
         agent = self.trainer.agent(self.state, self.data)
-        return run_tests(agent, groups, self.batches("evaluation"), key)
+        return run_tests(agent, groups, groups, self.batches("evaluation"), key)
 
 
 def divergence(stats: EpochStats, before: Sequence[EpochStats]) -> str | None:

@@ -44,7 +44,7 @@ from headway.task import episode_length, task_of
 from headway.training.collect import Environments
 from headway.training.diagnostics import prediction_error
 from headway.training.methods import told_sim_params
-from headway.training.run import RunDir, format_sim_params
+from headway.training.run import Iteration, RunDir, format_sim_params
 
 Epochs = Iterator[tuple[Any, EpochStats]]
 """State of training after each epoch, and the epoch's averages."""
@@ -133,13 +133,13 @@ class Trainer:
         """The state that the run's seed begins with."""
         return self.init(jax.random.fold_in(jax.random.key(self.config.seed), 0))
 
-    def load(self, run: RunDir) -> Any:
-        """Read the newest checkpoint of a run.
+    def load(self, run: RunDir, iteration: Iteration = None) -> Any:
+        """Read a checkpoint of a run, the newest by default.
 
         Raises:
-            RunError: No iteration is finished yet, or the checkpoint is damaged.
+            RunError: No such iteration is kept, or the checkpoint is damaged.
         """
-        return run.load_checkpoint(eqx.filter_eval_shape(self.begin))
+        return run.load_checkpoint(eqx.filter_eval_shape(self.begin), iteration)
 
 
 class TrainState(NamedTuple):
@@ -373,21 +373,26 @@ def make_trainer(config: Config, environments: Environments | None = None) -> Tr
 
 
 def load_agent(
-    run: RunDir, config: Config | None = None, environments: Environments | None = None
+    run: RunDir,
+    config: Config | None = None,
+    environments: Environments | None = None,
+    iteration: Iteration = None,
 ) -> Agent:
-    """The agent of a run, as trained so far.
+    """The agent of a run, as it was after an iteration.
 
     Args:
         run: The run.
         config: Its settings, with those of the planner perhaps changed; as it is by default.
         environments: As `make_trainer`.
+        iteration: As `RunDir.kept_iteration`; the newest by default.
 
     Raises:
-        RunError: There is no run, it has no finished iteration, or it is damaged.
+        RunError: There is no run, it does not keep the iteration, or it is damaged.
         ConfigError: It is a run on the true dynamics, and there are no environments.
     """
     config = config or run.config()
     trainer = make_trainer(config, environments)
-    state = trainer.load(run)
-    trajectories = run.load_data() if config.planner.adaptation != "none" else []
+    number = run.kept_iteration(iteration)
+    state = trainer.load(run, number)
+    trajectories = run.load_data(number) if config.planner.adaptation != "none" else []
     return trainer.agent(state, trajectories)
