@@ -93,7 +93,7 @@ def test_kills_change_nothing(seed, reference, tmp_path, monkeypatch):
             kills += 1
         train.train_run(runs.tiny_config(), path)
         assert runs.result(path) == runs.result(reference)
-    assert kills > 3
+    assert kills > 1  # a place beyond the end of a run kills nobody
 
 
 def test_a_finished_run_goes_on_to_more_iterations_wherever_it_is_killed(tmp_path, monkeypatch):
