@@ -90,7 +90,7 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
     run = train_run(
         config, path, progress, on_iteration, resume_from_last_good=resume_from_last_good
     )
-    return Run(run.path, config, run.metrics(), run.evaluation())
+    return Run(run.path, run.config(), run.metrics(), run.evaluation())
 
 
 def load(

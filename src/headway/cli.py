@@ -531,8 +531,7 @@ class List(Command):
                     "name": spec.name,
                     "id": spec.env_id,
                     "description": spec.description,
-                    "obs_size": task.obs_size,
-                    "action_size": task.action_size,
+                    **{name: getattr(task, name, None) for name in ("obs_size", "action_size")},
                     "episode_length": spec.episode_length,
                     "sim_params": groups,
                     "options": dict(spec.options),
@@ -544,7 +543,8 @@ class List(Command):
                     for group in groups.values()
                 )
                 cells = [spec.name, axis_label(names), train, "\n".join(unseen)]
-                sizes = map(str, (task.obs_size, task.action_size, spec.episode_length))
+                sizes = entry["obs_size"], entry["action_size"], spec.episode_length
+                sizes = (str(size or "–") for size in sizes)
                 table.add_row(*cells, "\n".join(spec.options) or "–", *sizes)
         elif self.what == "methods":
             table = new_table("Methods", "name", "description", "settings that differ from tmcl")

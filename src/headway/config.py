@@ -21,6 +21,7 @@ from pydantic import Field
 
 from headway.errors import ConfigError, did_you_mean, shown
 from headway.sim_params import SimParamSets
+from headway.spaces import Spaces
 
 LARGEST = 10**9
 """No number of anything is larger; a file that says so is wrong, or means harm."""
@@ -448,6 +449,8 @@ class Config:
     """Switches of the environment that differ from its defaults."""
     sim_params: Annotated[SimParamSets | None, pydantic.PlainValidator(_sim_params)] = None
     """Training and unseen simulator parameters; None takes the environment's own."""
+    spaces: Spaces | None = None
+    """Observation and action space; read from the environment when a run begins."""
     model: Annotated[ModelConfig, _tagged(MODELS, "kind")] = MultiHeadedConfig()
     """The dynamics model."""
     fitting: FittingConfig = FittingConfig()
@@ -603,9 +606,11 @@ def differences(old: Config, new: Config) -> list[str]:
 
 
 def tolerating_as(config: Config, other: Config) -> Config:
-    """Return `config` with the `TOLERANCE` of another one."""
+    """Return `config` with the `TOLERANCE` of another one; and its spaces, if one has none yet."""
     values = flatten(to_dict(other))
-    return override(config, {name: values[name] for name in TOLERANCE})
+    found = override(config, {name: values[name] for name in TOLERANCE})
+    unknown = None in (config.spaces, other.spaces)
+    return dataclasses.replace(found, spaces=other.spaces) if unknown else found
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

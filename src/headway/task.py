@@ -1,13 +1,14 @@
 """Tasks and the table of environments: all that a model and a planner must know of one, in JAX."""
 
 import abc
+import copy
 import dataclasses
 import functools
 import importlib
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,37 +17,37 @@ from jaxtyping import Array, Bool, Float
 
 from headway.errors import ConfigError, unknown_name
 from headway.sim_params import SimParamSets
+from headway.spaces import Spaces
 
 if TYPE_CHECKING:
     from headway.config import Config
 
 Obs = Float[Array, "*batch obs"]
 Action = Float[Array, "*batch action"]
+Scaled = Float[Array, "*batch scaled"]
 Reward = Float[Array, "*batch"]
 Ends = Bool[Array, "*batch"]
 HostAction = Float[np.ndarray, "*batch action"]
+HostScaled = Float[np.ndarray, "*batch scaled"]
 
 
 class Task(eqx.Module):
     """The reward, the end of an episode, and how observations enter and leave a model.
 
     Every method is pure JAX and written for one transition with any number of leading
-    axes. `action` is always in the environment's own units; the model and the planner work
-    with actions scaled to [-1, 1] and convert with `scale_action`.
+    axes. `action` is always in the environment's own units, in one row: the number of a category
+    or of each of several ones. The model and the planner work with actions scaled to [-1, 1]
+    (`Spaces`) and convert with `scale_action`.
 
-    Subclasses state the sizes as class variables (a property where an option changes one)
-    and override what differs from the plain case: preprocess = identity, target =
-    next_obs - obs, no termination. Options of an environment are fields of its Task.
+    Sizes and bounds are the environment's. Where a subclass states one as class variable (a
+    property where an option changes one), that counts. Subclasses override what differs from the
+    plain case: preprocess = identity, target = next_obs - obs, no termination. Options of an
+    environment are fields of its Task.
 
     Example:
         A point pushed along a line, which should stay at zero:
 
         >>> class LineTask(Task):
-        ...     obs_size: ClassVar[int] = 2
-        ...     action_size: ClassVar[int] = 1
-        ...     action_low: ClassVar[tuple[float, ...]] = (-1.0,)
-        ...     action_high: ClassVar[tuple[float, ...]] = (1.0,)
-        ...
         ...     def reward(self, obs, action, next_obs):
         ...         return -jnp.square(next_obs[..., 0])
     """
@@ -55,6 +56,26 @@ class Task(eqx.Module):
     action_size: ClassVar[int]
     action_low: ClassVar[tuple[float, ...]]
     action_high: ClassVar[tuple[float, ...]]
+    told_spaces: Spaces | None = eqx.field(static=True, default=None, kw_only=True)
+    """What a run read from its environment."""
+
+    if not TYPE_CHECKING:  # which would take every misspelt name for one of these
+
+        def __getattr__(self, name):
+            names = "obs_size", "action_size", "action_low", "action_high"
+            if name in names and self.told_spaces is not None:
+                return getattr(self.told_spaces, name)
+            advice = "; a run reads it from the environment, elsewhere state " + ", ".join(names)
+            known = (*names, "spaces")  # where the property below finds that one is missing
+            raise AttributeError(f"{type(self).__name__} has no {name}{advice * (name in known)}.")
+
+    @property
+    def spaces(self) -> Spaces:
+        """Sizes, bounds and kind of actions; by default float32 within the stated bounds."""
+        if self.told_spaces is not None:
+            return self.told_spaces
+        bounds = tuple(self.action_low), tuple(self.action_high)
+        return Spaces(self.obs_size, "box", *bounds, (self.action_size,), "float32")
 
     @abc.abstractmethod
     def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
@@ -81,15 +102,17 @@ class Task(eqx.Module):
         """Undo `target`: `postprocess(obs, target(obs, next_obs)) == next_obs`."""
         return obs + delta
 
-    def scale_action(self, action: Action) -> Action:
+    def scale_action(self, action: Scaled) -> Action:
         """Map an action from [-1, 1] to the environment's own units."""
-        low, high = jnp.asarray(self.action_low), jnp.asarray(self.action_high)
-        return low + 0.5 * (action + 1.0) * (high - low)
+        return self.spaces.scale(action, jnp)
 
-    def unscale_action(self, action: Action) -> Action:
+    def unscale_action(self, action: Action) -> Scaled:
         """Map an action from the environment's own units to [-1, 1]."""
-        low, high = jnp.asarray(self.action_low), jnp.asarray(self.action_high)
-        return 2.0 * (action - low) / (high - low) - 1.0
+        return self.spaces.unscale(action, jnp)
+
+    def project_action(self, action: Scaled) -> Scaled:
+        """The nearest action in [-1, 1] that the environment can take: a category, an integer."""
+        return self.spaces.project(action, jnp)
 
     def clip_action(self, action: Action) -> Action:
         """Limit an action in the environment's own units to its range, as the envs do."""
@@ -101,17 +124,19 @@ class Task(eqx.Module):
         return eqx.filter_eval_shape(self.preprocess, np.zeros(self.obs_size, np.float32)).shape[-1]
 
 
-def env_action(task: Task, action: HostAction) -> HostAction:
-    """`Task.scale_action` in NumPy, exactly within the environment's bounds."""
-    low, high = np.asarray(task.action_low), np.asarray(task.action_high)
-    scaled = low + 0.5 * (action.astype(np.float64) + 1.0) * (high - low)
-    return np.clip(scaled, low, high).astype(np.float32)
+def env_action(task: Task, action: HostScaled) -> Any:
+    """`Task.scale_action` in NumPy, of the shape and type that `env.step` takes, within bounds."""
+    spaces = task.spaces
+    own = spaces.scale(action.astype(np.float64), np)
+    if spaces.action_kind != "box":
+        own = np.rint(own)
+    own = np.clip(own, spaces.action_low, spaces.action_high).astype(spaces.action_dtype)
+    return own.reshape((*action.shape[:-1], *spaces.action_shape))[()]
 
 
-def scaled_action(task: Task, action: HostAction) -> HostAction:
+def scaled_action(task: Task, action: HostAction) -> HostScaled:
     """`Task.unscale_action` in NumPy."""
-    low, high = np.asarray(task.action_low), np.asarray(task.action_high)
-    return (2.0 * (action.astype(np.float64) - low) / (high - low) - 1.0).astype(np.float32)
+    return task.spaces.unscale(action.astype(np.float64), np).astype(np.float32)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -258,8 +283,10 @@ def env_options(config: "Config") -> dict[str, bool]:
 
 
 def task_of(config: "Config") -> Task:
-    """The Task of a run, with its environment's options."""
-    return env_spec(config.env).make_task(**env_options(config))
+    """The Task of a run, with its environment's options and spaces."""
+    task = copy.copy(env_spec(config.env).make_task(**env_options(config)))
+    object.__setattr__(task, "told_spaces", config.spaces)  # its own __init__ may take anything
+    return task
 
 
 def sim_param_sets(config: "Config") -> SimParamSets:

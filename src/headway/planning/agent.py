@@ -122,6 +122,7 @@ class Agent(eqx.Module):
         if self.model is None:
             key, draw = jax.random.split(state.key)
             action = jax.random.uniform(draw, state.action.shape, minval=-1.0)
+            action = self.task.project_action(action)
             none = jnp.zeros(len(obs), jnp.int32)
             return state._replace(action=action, key=key), Decision(action, None, none, none)
         # Threads know nothing of a step that is part of another program (jit, vmap).
@@ -146,7 +147,7 @@ class Agent(eqx.Module):
         optimizer, precision = self.optimizer, self.planner.precision
         # Iterations of a kind are one program; which of them it is decides the key alone.
         which = plan.key, np.int32(iteration), iteration * optimizer.unrolled
-        candidates, key = _ask(optimizer, plan.search, *which)
+        candidates, key = _ask(optimizer, self.task, plan.search, *which)
         total, shards = candidates.shape[1], self._num_shards(len(plan.obs))
 
         def returns_of(shard: cpu.Shard | None) -> Float[Array, "env shard"]:
@@ -183,6 +184,7 @@ def decide(agent: Agent, plan: Plan) -> tuple[AgentState, Decision]:
     """Take a plan's first action; where its search ended, one step later, is the next start."""
     search, acted = plan.search, jnp.ones(len(plan.obs), bool)
     action, start = search.actions[:, 0], agent.optimizer.shift(search)
+    action = agent.task.project_action(action)
     state = AgentState(plan.belief, plan.obs, action, acted, start, plan.next_key)
     heads = getattr(plan.belief, "heads", None)
     return state, Decision(action, heads, search.non_finite, search.evaluations)
@@ -198,7 +200,8 @@ def step(
         args = plan.dynamics, agent.task, obs, candidates
         return candidate_returns(*args, planner=agent.planner, key=key)
 
-    search = agent.optimizer.optimize(score, plan.search, key=plan.key)
+    project = agent.task.project_action
+    search = agent.optimizer.optimize(score, plan.search, key=plan.key, project=project)
     return decide(agent, plan._replace(search=search))
 
 
@@ -208,12 +211,17 @@ _decide = jit_networks(decide)
 
 @jit_networks
 def _ask(
-    optimizer: Optimizer, search: Any, plan_key: PRNGKeyArray, iteration: Int[Any, ""], kind: int
+    optimizer: Optimizer,
+    task: Task,
+    search: Any,
+    plan_key: PRNGKeyArray,
+    iteration: Int[Any, ""],
+    kind: int,
 ) -> tuple[Float[Array, "env candidate horizon action"], PRNGKeyArray]:
     """Candidates, and the key that scores them; keys as in `Optimizer.optimize`."""
     key = jax.random.split(plan_key, optimizer.num_iterations)[iteration]
     ask_key, score_key = jax.random.split(key)
-    return optimizer.ask(search, ask_key, kind), score_key
+    return task.project_action(optimizer.ask(search, ask_key, kind)), score_key
 
 
 @jit_networks
@@ -227,16 +235,16 @@ def _tell(
 
 
 @eqx.filter_jit
-def open_loop(planner: PlannerConfig, state: AgentState) -> AgentState:
+def open_loop(agent: Agent, state: AgentState) -> AgentState:
     """Go on along the last plan without a look: its next action is the state's `action`.
 
     The plan is what the search's distribution was centred on in the end. The transition that the
     action causes is not observed, because it begins unseen.
 
     Args:
-        planner: The settings that made the plan.
-        state: Of an agent that plans.
+        agent: It plans.
+        state: Its state.
     """
-    search = make_optimizer(planner).shift(state.search)
-    unseen = jnp.zeros_like(state.acted)
-    return state._replace(action=state.search.nominal[:, 0], acted=unseen, search=search)
+    search, unseen = agent.optimizer.shift(state.search), jnp.zeros_like(state.acted)
+    action = agent.task.project_action(state.search.nominal[:, 0])
+    return state._replace(action=action, acted=unseen, search=search)

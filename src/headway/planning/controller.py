@@ -1,5 +1,6 @@
 """One robot's controller: observations in, actions out, in the environment's own units."""
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -118,7 +119,7 @@ class Controller:
 
     def act(
         self, obs: ArrayLike, *, applied_action: ArrayLike | None = None
-    ) -> Float[np.ndarray, " action"]:
+    ) -> np.ndarray | np.integer:
         """Choose the next action.
 
         Args:
@@ -130,7 +131,8 @@ class Controller:
                 that step then. At the first call of an episode no action counts.
 
         Returns:
-            The action, in the environment's own units and within its bounds.
+            The action, as `env.step` takes it: in the environment's own units, of its type and
+            within its bounds.
 
         Raises:
             ConfigError: The observation or the applied action has another shape, the applied
@@ -145,7 +147,8 @@ class Controller:
                 f"the controller was told no sim_params, allowed: a value for each of {names},"
                 ' which its model takes as input; call reset(sim_params=info["sim_params"]) first.'
             )
-        row = _row("obs", obs, task.obs_size, "pass one observation as the environment returns it")
+        advice = "pass one observation as the environment returns it"
+        row = _row("obs", obs, (task.obs_size,), advice)
         if applied_action is not None:
             self._correct(applied_action)
         finite = np.isfinite(row)
@@ -234,17 +237,17 @@ class Controller:
         in_time, late = float("inf"), -float("inf")
         for self._left, started in ((0, in_time), (1, in_time), (1, late), (0, late)):
             self._search(obs, started)
-        for action in (task.action_low, np.full(task.action_size, np.nan)):
-            self._correct(action)
+        for numbers in (task.action_low, np.full(len(task.action_low), np.nan)):
+            self._correct(np.reshape(numbers, task.spaces.action_shape))
         self._hold()
         for _ in range(3):
             for durations in self._durations.values():
                 durations.clear()  # the first times are those of compiling
             self._search(obs, in_time)
 
-    def _hold(self) -> Float[np.ndarray, " action"]:
+    def _hold(self) -> np.ndarray | np.integer:
         """The next action of the last plan, without a look (open loop)."""
-        self._state = open_loop(self.agent.planner, self._state)
+        self._state = open_loop(self.agent, self._state)
         return env_action(self.agent.task, jax.device_get(self._state.action)[0])
 
     def _count_left(self, *, held: bool, reason: str) -> None:
@@ -271,7 +274,7 @@ class Controller:
         """
         task = self.agent.task
         advice = "pass one action in the environment's units, as `act` returns it"
-        action = _row("applied_action", applied_action, task.action_size, advice)
+        action = _row("applied_action", applied_action, task.spaces.action_shape, advice).ravel()
         if not np.isfinite(action).all():
             self._state = self._state._replace(acted=jnp.asarray(np.zeros(1, bool)))
             return
@@ -308,8 +311,8 @@ class Controller:
         )
 
 
-def _row(name: str, given: Any, size: int, advice: str) -> Float[np.ndarray, " size"]:
-    """One row of float32.
+def _row(name: str, given: Any, shape: tuple[int, ...], advice: str) -> Float[np.ndarray, "..."]:
+    """Numbers of float32.
 
     Raises:
         ConfigError: It has another shape, or is no numbers.
@@ -318,7 +321,8 @@ def _row(name: str, given: Any, size: int, advice: str) -> Float[np.ndarray, " s
         with np.errstate(over="ignore"):  # what is too large becomes infinite
             row = np.asarray(given).astype(np.float32)
     except (TypeError, ValueError):
-        raise ConfigError(f"{name} is {shown(given)}, allowed: {size} numbers; {advice}.") from None
-    if row.shape != (size,):
-        raise ConfigError(f"{name} has shape {row.shape}, allowed: ({size},); {advice}.")
+        allowed = f"{math.prod(shape)} numbers"
+        raise ConfigError(f"{name} is {shown(given)}, allowed: {allowed}; {advice}.") from None
+    if row.shape != shape:
+        raise ConfigError(f"{name} has shape {row.shape}, allowed: {shape}; {advice}.")
     return row

@@ -13,11 +13,12 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
-from headway.config import Config
+from headway.config import LARGEST, Config, differences, tolerating_as
 from headway.data import Trajectory
-from headway.errors import BadEnvironmentError, HeadwayError
+from headway.errors import BadEnvironmentError, HeadwayError, shown
 from headway.planning.agent import Agent
 from headway.sim_params import SimParamSets
+from headway.spaces import Spaces
 from headway.task import (
     Task,
     env_action,
@@ -57,12 +58,13 @@ class Environments:
         """Make as many as a configuration collects episodes.
 
         Raises:
-            BadEnvironmentError: The environment's spaces do not fit its Task.
+            BadEnvironmentError: The environment's spaces do not fit its Task or its run, or no
+                plan is made in such spaces.
         """
         from headway import envs  # a controller is loaded without a simulator
 
         collection, options = config.collection, env_options(config)
-        task, sim_params = task_of(config), sim_param_sets(config)
+        sim_params = sim_param_sets(config)
         vector = envs.make_vec(
             config.env,
             collection.num_episodes,
@@ -71,19 +73,50 @@ class Environments:
             episode_length=episode_length(config),
             step_timeout_s=collection.step_timeout_s if collection.env_processes else None,
         )
-        got = (vector.single_observation_space.shape, vector.single_action_space.shape)
-        allowed = ((task.obs_size,), (task.action_size,))
-        if got != allowed:
+        try:
+            read = envs.read_spaces(vector.single_observation_space, vector.single_action_space)
+            task = _task_in(config, read)
+        except HeadwayError:
             vector.close()
-            raise BadEnvironmentError(
-                f"{config.env} has observation and action shapes {got}, allowed: {allowed}, as"
-                f" its Task says; correct the environment or the Task."
-            )
+            raise
         return cls(config.env, task, vector, sim_params, episode_length(config))
 
     def close(self) -> None:
         """Free what the environments hold, and end their processes."""
         self.vector.close()
+
+
+def _task_in(config: Config, read: Spaces) -> Task:
+    """The Task of a run, told the spaces of its environment; what it states itself counts.
+
+    Raises:
+        BadEnvironmentError: They contradict each other, or actions are not bounded.
+    """
+    task = task_of(dataclasses.replace(config, spaces=read))
+    low, high = tuple(task.action_low), tuple(task.action_high)
+    stated = task.obs_size, task.action_size, len(low), len(high)
+    found = read.obs_size, read.action_size, *2 * [len(read.action_low)]
+    if stated != found:
+        raise BadEnvironmentError(
+            f"the Task of {config.env} states {stated} as obs_size, action_size and numbers of"
+            f" bounds, but its environment has {found}; correct the Task, or let it state none."
+        )
+    width, whole = np.subtract(high, low), read.action_kind != "box"
+    widest = LARGEST if whole else np.finfo(np.float32).max
+    if not ((width + whole > 0) & (width <= widest)).all():
+        raise BadEnvironmentError(
+            f"the actions of {config.env} have action_low {shown(low)} and action_high"
+            f" {shown(high)}, allowed: finite bounds, the lower one first; correct the space, or"
+            " state both in the Task."
+        )
+    spaces = dataclasses.replace(read, action_low=low, action_high=high)
+    told = dataclasses.replace(config, spaces=spaces)
+    if changed := differences(tolerating_as(config, told), told):
+        raise BadEnvironmentError(
+            f"{config.env} has other spaces than its run ({'; '.join(changed)}); bring them back,"
+            " or train another run."
+        )
+    return task_of(told)
 
 
 class Choice(NamedTuple):
@@ -105,7 +138,12 @@ def random_policy(environments: Environments, rng: np.random.Generator) -> Polic
     """Uniform random actions, as in the first iteration."""
     num_envs = environments.vector.num_envs
     shape, none = (num_envs, environments.task.action_size), np.zeros(num_envs, int)
-    return lambda obs: Choice(rng.uniform(-1.0, 1.0, shape).astype(np.float32), none, none)
+
+    def choose(obs: Float[np.ndarray, "env obs"]) -> Choice:
+        draws = rng.uniform(-1.0, 1.0, shape).astype(np.float32)
+        return Choice(environments.task.spaces.project(draws, np), none, none)
+
+    return choose
 
 
 def agent_policy(

@@ -87,6 +87,7 @@ def train_run(
                 else f"goes on after iteration {good}, which is intact"
             )
         with closing(Environments.make(config)) as environments:
+            config = dataclasses.replace(config, spaces=environments.task.spaces)
             run.begin(config)
             _Training(config, run, environments, shown, stop, on_iteration).train()
     return run

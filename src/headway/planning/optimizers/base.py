@@ -92,18 +92,26 @@ class Optimizer(eqx.Module):
             returns: Their returns.
         """
 
-    def optimize(self, score: Score, search: Search, *, key: PRNGKeyArray) -> Search:
+    def optimize(
+        self,
+        score: Score,
+        search: Search,
+        *,
+        key: PRNGKeyArray,
+        project: Callable[[Array], Array] = lambda candidates: candidates,
+    ) -> Search:
         """Search for the best action sequence of every environment.
 
         Args:
             score: Returns of candidates.
             search: Where to start.
             key: Draws the candidates, and is handed on to `score`.
+            project: Turns candidates into actions that can be taken, before they are scored.
         """
 
         def iterate(search, key, iteration=0):
             ask_key, score_key = jax.random.split(key)
-            candidates = self.ask(search, ask_key, iteration)
+            candidates = project(self.ask(search, ask_key, iteration))
             return self.tell(search, candidates, score(candidates, score_key)), None
 
         keys = jax.random.split(key, self.num_iterations)
