@@ -211,12 +211,7 @@ _decide = jit_networks(decide)
 
 @jit_networks
 def _ask(
-    optimizer: Optimizer,
-    task: Task,
-    search: Any,
-    plan_key: PRNGKeyArray,
-    iteration: Int[Any, ""],
-    kind: int,
+    optimizer: Optimizer, task: Task, search: Any, plan_key: PRNGKeyArray, iteration: Any, kind: int
 ) -> tuple[Float[Array, "env candidate horizon action"], PRNGKeyArray]:
     """Candidates, and the key that scores them; keys as in `Optimizer.optimize`."""
     key = jax.random.split(plan_key, optimizer.num_iterations)[iteration]

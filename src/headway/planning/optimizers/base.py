@@ -93,12 +93,7 @@ class Optimizer(eqx.Module):
         """
 
     def optimize(
-        self,
-        score: Score,
-        search: Search,
-        *,
-        key: PRNGKeyArray,
-        project: Callable[[Array], Array] = lambda candidates: candidates,
+        self, score: Score, search: Search, *, key: PRNGKeyArray, project: Callable = lambda x: x
     ) -> Search:
         """Search for the best action sequence of every environment.
 
