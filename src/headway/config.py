@@ -283,6 +283,9 @@ class CEMConfig(OptimizerConfig):
     """Share of the old mean and spread that is kept at each iteration."""
     initial_std: Std = 0.5
     """Standard deviation of the first candidates, actions being scaled to [-1, 1]."""
+    narrow_at_bounds: Flag = False
+    """Candidates spread less near the bounds (the paper's way), where plans then stay for many
+    steps after what is best has changed; otherwise they are truncated there."""
 
 
 @settings

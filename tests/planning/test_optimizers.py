@@ -95,6 +95,10 @@ def test_plans_and_candidates_stay_within_bounds_and_shape(optimizer, start):
     assert optimizer.max_evaluations == sum(x.shape[1] for x in seen)
 
 
+def test_a_plan_at_a_bound_leaves_it_when_what_is_best_has_changed(optimizer):
+    assert search(optimizer, [-0.9, -0.9], start=1.0).actions.mean() < 0.8
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_non_finite_returns_rank_last(optimizer, bad):
     found = search(optimizer, [0.9, 0.9], bad=bad, bad_if_positive=True)
@@ -180,16 +184,23 @@ def best_of(candidates, count):
     return np.take_along_axis(candidates, order[:, :, None, None], axis=1)
 
 
-@pytest.mark.parametrize("start", [0.0, 0.5])
-def test_cem_equals_its_numpy_twin(start):
-    cem, mean = SMALL_CEM, np.float64(plan_of(start))
+@pytest.mark.parametrize(
+    ("start", "narrow"), [(0.0, False), (0.9, False), (-1.0, False), (0.0, True), (0.5, True)]
+)
+def test_cem_equals_its_numpy_twin(start, narrow):
+    cem = dataclasses.replace(SMALL_CEM, narrow_at_bounds=narrow)
+    mean = np.float64(plan_of(start))
     var = np.full(mean.shape, cem.initial_std**2)
     found, seen = watch(cem, towards(AIMS), begin(cem, start))
     for key, got in zip(ask_keys(cem), seen, strict=True):
         shape = (NUM_ENVS, cem.num_candidates, HORIZON, ACTIONS)
-        draws = np.float64(jax.random.truncated_normal(key, -2.0, 2.0, shape))
-        room = np.minimum((mean + 1) / 2, (1 - mean) / 2)
-        candidates = mean[:, None] + np.minimum(room, np.sqrt(var))[:, None] * draws
+        std, room = np.sqrt(var), 1 - np.abs(mean)
+        low, high = np.maximum(-2, -(1 + mean) / std), np.minimum(2, (1 - mean) / std)
+        if narrow:
+            std, low, high = np.minimum(room / 2, std), np.full_like(std, -2), np.full_like(std, 2)
+        truncated = np.float32(low[:, None]), np.float32(high[:, None])
+        draws = np.float64(jax.random.truncated_normal(key, *truncated, shape))
+        candidates = mean[:, None] + std[:, None] * draws
         np.testing.assert_allclose(got, candidates, atol=1e-5)
         elites = best_of(candidates, cem.num_elites)
         mean = cem.smoothing * mean + (1 - cem.smoothing) * elites.mean(1)

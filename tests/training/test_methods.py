@@ -5,7 +5,7 @@ import itertools
 
 import pytest
 
-from headway.config import Config
+from headway.config import CEMConfig, Config, override
 from headway.errors import ConfigError
 from headway.planning.rollouts import plan_flop
 from headway.task import env_names, env_spec
@@ -22,8 +22,9 @@ def test_every_combination_is_a_valid_configuration(method):
         assert (config.env, config.method, config.preset) == (env, method, preset)
 
 
-def test_paper_preset_is_the_defaults_and_the_environments_epochs():
-    assert make_config("half-cheetah") == Config("half-cheetah")
+def test_paper_preset_is_the_defaults_its_own_search_and_the_environments_epochs():
+    own_search = {"planner.optimizer.narrow_at_bounds": True}
+    assert make_config("half-cheetah") == override(Config("half-cheetah"), own_search)
     assert make_config("pendulum").fitting.epochs == 5
 
 
@@ -53,6 +54,7 @@ def test_released_code_preset_flips_the_choices_that_differ():
     assert not fitting.context_weight_decay
     assert (planner.selection_error, planner.reward) == ("sampled", "released")
     assert planner.selection_skips_newest
+    assert planner.optimizer == CEMConfig(narrow_at_bounds=True)
     assert config.env_options == {"observe_average_velocity": False}
 
 

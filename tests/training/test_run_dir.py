@@ -145,7 +145,7 @@ def test_settings_versions_and_commit_are_kept(root):
 def test_another_schema_is_refused_with_the_reason(root):
     values = json.loads((root / "config.json").read_text())
     (root / "config.json").write_text(json.dumps({**values, "schema": 2}))
-    assert "schema 2, allowed: 3; train the run again" in refused(RunDir(root).config)
+    assert "schema 2, allowed: 4; train the run again" in refused(RunDir(root).config)
 
 
 def test_other_settings_are_refused_with_the_difference(root):

@@ -159,6 +159,7 @@ _METHODS = (
 
 METHODS: dict[str, Method] = {method.name: method for method in _METHODS}
 
+PAPERS_SEARCH = {"planner.optimizer.narrow_at_bounds": True}
 SMALL_SEARCH = {
     "planner.num_candidates": 100,
     "planner.optimizer.num_elites": 20,
@@ -190,6 +191,7 @@ def _released_code(spec: EnvSpec) -> Settings:
         "planner.selection_error": "sampled",
         "planner.selection_skips_newest": True,
         "planner.reward": "released",
+        **PAPERS_SEARCH,
     }
 
 
@@ -235,7 +237,7 @@ _PRESETS = (
     Preset(
         "paper",
         "the supplement's numbers; wants a GPU",
-        lambda spec: {"fitting.epochs": spec.epochs},
+        lambda spec: {"fitting.epochs": spec.epochs, **PAPERS_SEARCH},
     ),
     Preset("fast", "the paper's, but for a planner of at most a tenth of its arithmetic", _fast),
     Preset("quick", "a smaller network, planner and schedule; minutes on a laptop", _quick),

@@ -55,7 +55,7 @@ from headway.training.files import (
 Iteration = int | Literal["best"] | None
 """An iteration, from 0; the one whose model collected the highest mean return; or the newest."""
 
-SCHEMA = 3  # of a run directory
+SCHEMA = 4  # of a run directory
 KEPT = 2  # newest iterations whose checkpoints and tests stay, unless settings say more
 LOCK = ".lock"
 VERSIONED = ("headway", "jax", "jaxlib", "equinox", "optax", "numpy", "gymnasium", "mujoco")

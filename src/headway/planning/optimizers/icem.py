@@ -3,11 +3,16 @@
 import jax.numpy as jnp
 
 from headway.data import where_env
-from headway.planning.optimizers.base import best_candidates, colored_noise, moments, shift_steps
-from headway.planning.optimizers.cem import CEM
+from headway.planning.optimizers.base import (
+    Optimizer,
+    best_candidates,
+    colored_noise,
+    moments,
+    shift_steps,
+)
 
 
-class ICEM(CEM):
+class ICEM(Optimizer):
     """Cross-entropy method with coloured noise and memory (Pinneri et al., 2020, algorithm 1).
 
     Candidates are clipped to the bounds. Fewer are drawn in each iteration. A share of the
@@ -17,6 +22,8 @@ class ICEM(CEM):
     """
 
     num_elites: int = 10
+    smoothing: float = 0.1
+    initial_std: float = 0.5
     noise_beta: float = 2.0
     population_decay: float = 1.25
     kept_elite_fraction: float = 0.3
