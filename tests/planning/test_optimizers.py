@@ -242,8 +242,10 @@ def test_mppi_equals_its_numpy_twin(beta):
         noise = np.float64(colored_noise(key, shape, beta))
         candidates = np.clip(mean[:, None] + mppi.initial_std * noise, -1, 1)
         returns = numpy_returns(candidates)
-        standard = (returns - returns.mean(1, keepdims=True)) / returns.std(1, keepdims=True)
-        weights = np.exp(standard / mppi.temperature)
+        above = returns - np.median(returns, axis=1, keepdims=True)
+        better_half = np.sort(above, axis=1)[:, mppi.num_candidates // 2 :]
+        unit = np.sqrt((better_half**2).mean(1, keepdims=True))
+        weights = np.exp(above / unit / mppi.temperature)
         weights /= weights.sum(1, keepdims=True)
         mean = np.einsum("ec,ecta->eta", weights, candidates)
     np.testing.assert_allclose(found.actions, mean, atol=1e-5)
@@ -303,6 +305,12 @@ def test_equal_returns_weigh_the_same_in_mppi_and_non_finite_ones_nothing():
     found = softmax_weights(odd, 0.5)
     np.testing.assert_allclose(found[:3], [[0.5, 0.5, 0], [0, 0, 0], [0, 1, 0]], atol=1e-6)
     assert np.isfinite(found).all()
+
+
+def test_how_bad_the_worst_candidate_is_changes_no_weight_in_mppi():
+    bad, worse = (softmax_weights(jnp.asarray([[low, 1.0, 2.0, 5.0]]), 0.5) for low in (-99, -1e6))
+    np.testing.assert_allclose(bad[0, 1:], worse[0, 1:], rtol=1e-4)
+    assert worse[0, 3] > 2 * worse[0, 2] > 4 * worse[0, 1] > 8 * worse[0, 0]
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,12 @@ class MPPI(Optimizer):
     """Information-theoretic MPPI, some iterations per step (Williams et al., 2017).
 
     The plan is the average of all candidates, weighted by exp(return / temperature). The returns
-    are standardised over the candidates of an iteration, so one temperature suits tasks whose
-    rewards differ in scale. The candidates' deviation stays `initial_std`. They are clipped to
-    the bounds, and the cost of control is what the return says: the method's own term for it,
-    which weighs the noise against the mean, is left out, as for a base distribution centred at
-    the mean. The expected return is the weighted mean return of the last iteration.
+    are standardised by the better half of an iteration's candidates, so one temperature suits
+    tasks whose rewards differ in scale, and a few very bad candidates do not matter. The
+    candidates' deviation stays `initial_std`. They are clipped to the bounds, and the cost of
+    control is what the return says: the method's own term for it, which weighs the noise against
+    the mean, is left out, as for a base distribution centred at the mean. The expected return is
+    the weighted mean return of the last iteration.
     """
 
     initial_std: float = 0.5
@@ -49,12 +50,16 @@ def softmax_weights(
 ) -> Float[Array, "env candidate"]:
     """Weights that sum to 1, by the softmax of the standardised returns over a temperature.
 
+    The unit is the better half's deviation from the median: the standard deviation wherever
+    returns lie symmetrically, but no bad outlier changes it.
+
     Equal returns weigh the same; a return of -inf weighs nothing, and so do all of them where
     nothing is finite.
     """
     finite = jnp.isfinite(returns)
-    mean = jnp.mean(returns, axis=-1, keepdims=True, where=finite)
-    std = jnp.std(returns, axis=-1, keepdims=True, where=finite)
-    logits = (returns - mean) / jnp.where(std > 0, std, 1.0) / temperature
+    median = jnp.nanmedian(jnp.where(finite, returns, jnp.nan), axis=-1, keepdims=True)
+    above = returns - median
+    square = jnp.mean(jnp.square(above), axis=-1, keepdims=True, where=finite & (above >= 0))
+    logits = above / jnp.where(square > 0, jnp.sqrt(square), 1.0) / temperature
     weights = jax.nn.softmax(jnp.where(finite, logits, -jnp.inf), axis=-1)
     return jnp.where(finite, weights, 0.0)
