@@ -53,6 +53,7 @@ RUNS = {
             "planner.selection_error": "sampled",
             "planner.selection_skips_newest": True,
             "planner.reward": "released",
+            "planner.optimizer.narrow_at_bounds": True,
         },
     ),
 }
