@@ -35,6 +35,8 @@ from .task import EnvSpec as EnvSpec
 from .task import Task as Task
 from .task import env_spec as env_spec
 from .task import register as register
+from .training.check import Finding as Finding
+from .training.check import check as check
 from .training.evaluate import Evaluation as Evaluation
 from .training.evaluate import evaluate as evaluate
 from .training.methods import METHODS as METHODS

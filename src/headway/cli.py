@@ -86,7 +86,7 @@ class Command:
         del names
         return self
 
-    def show(self, facts: Mapping[str, Any], *tables: Any) -> int:
+    def show(self, facts: Mapping[str, Any] | Sequence[Any], *tables: Any) -> int:
         """Print facts as one JSON line, or tables and text for people."""
         if self.json:
             print(json.dumps(facts, allow_nan=False))
@@ -573,6 +573,26 @@ class List(Command):
 
 
 @dataclasses.dataclass(frozen=True)
+class Check(Command):
+    """Compare an environment with its Task, within seconds; exit code 1 if there is a fault."""
+
+    env: EnvName = tyro.MISSING
+    """Short name or id of an environment; `module:name` for one of your own."""
+
+    def run(self, words):
+        """Check, and print a table of what was looked at."""
+        from headway.lab.tables import new_table
+        from headway.training.check import check
+
+        found = check(self.env)
+        table = new_table(f"{self.env} and its Task", "", "looked at", "found, and what to do")
+        for row in found:
+            table.add_row({"ok": "✓", "fault": "✗", "remark": "–"}[row.status], row.name, row.text)
+        self.show([dataclasses.asdict(row) for row in found], table)
+        return int(any(row.status == "fault" for row in found))
+
+
+@dataclasses.dataclass(frozen=True)
 class PlotDynamics(Command):
     """Draw the next states of the same states and actions under each training physics."""
 
@@ -611,6 +631,7 @@ COMMANDS: dict[str, type[Command]] = {
     "reproduce": Reproduce,
     "sweep": Sweep,
     "list": List,
+    "check": Check,
     "plot-dynamics": PlotDynamics,
 }
 

@@ -411,6 +411,9 @@ class CollectionConfig:
     """Seconds that a step or reset may take before its process is given up (env_processes)."""
     num_checkpoints: Annotated[int, Field(strict=True, ge=2, le=LARGEST)] = 2
     """Newest iterations that can be loaded; the best one is kept as well."""
+    check: Flag = True
+    """An environment of your own is compared with its Task before training, as `headway check`
+    does, and with what it was when the run was begun."""
 
 
 @settings
@@ -499,10 +502,11 @@ TOLERANCE = (
     "collection.env_processes",
     "collection.step_timeout_s",
     "collection.num_checkpoints",
+    "collection.check",
     "evaluation.max_bad_episodes",
 )
-"""Settings about environments that break, and checkpoints; the numbers of sound episodes do not
-depend on it, so a run may go on with other values."""
+"""Settings about checkpoints, and about environments that are wrong or break; the numbers of sound
+episodes do not depend on it, so a run may go on with other values."""
 
 
 def to_dict(config: Config) -> dict[str, Any]:

@@ -38,7 +38,8 @@ def drift():
 
 
 def config(**settings):
-    return runs.tiny_config("drift", **{"collection.episode_length": 6, **settings})
+    own = {"collection.episode_length": 6, "collection.check": False}
+    return runs.tiny_config("drift", **{**own, **settings})
 
 
 @pytest.fixture(scope="module")

@@ -267,6 +267,8 @@ class SequentialVectorEnv(HeadwayVectorEnv):
             self._check_spaces(own)
         self._sets, self._changes = sim_params, {}
         self._obs: list[Any] = [np.zeros(spaces[0][0].shape or ()) for _ in spaces]
+        self.told: list[SimParams] = [{} for _ in spaces]
+        """What each environment said at its reset that its simulator parameters are."""
 
     def _make_all(self, env_fns: Makers) -> list[Any]:
         return [make() for make in env_fns]
@@ -294,7 +296,7 @@ class SequentialVectorEnv(HeadwayVectorEnv):
         begun = self._call("reset", {i: (seeds[i], options[i]) for i in seeds})
         for i, (obs, sim_params, spaces) in begun.items():
             self._check_spaces(spaces)
-            self._obs[i] = self._check_obs(obs)
+            self._obs[i], self.told[i] = self._check_obs(obs), sim_params
             self._note(i, sim_params)
 
     def _change(self, i: int, changed: SimParams) -> None:

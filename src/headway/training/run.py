@@ -1,6 +1,6 @@
 """The run directory, and what makes an iteration count.
 
-    config.json                             settings, versions, device, commit
+    config.json                             settings, own environment, versions, device, commit
     metrics.jsonl                           one line per iteration
     evaluation.csv                          one row per test episode
     assignments.csv                         share of segments that each head owns, by physics
@@ -51,6 +51,7 @@ from headway.training.files import (
     write_json,
     writing,
 )
+from headway.training.identity import changes, identity
 
 Iteration = int | Literal["best"] | None
 """An iteration, from 0; the one whose model collected the highest mean return; or the newest."""
@@ -172,14 +173,15 @@ class RunDir:
         What does not change its numbers may differ (`config.TOLERANCE`), and it may become longer.
 
         Raises:
-            RunError: The directory holds a run with other settings, or a damaged one; the
-                message says how to go back.
+            RunError: The directory holds a run with other settings or of an environment that was
+                changed since, or a damaged one; the message says how to go back.
         """
         if self._is_new():
             versions = {name: importlib.metadata.version(name) for name in VERSIONED}
             values = {
                 "schema": SCHEMA,
                 "config": to_dict(config),
+                "environment": identity(config),
                 "versions": {"python": platform.python_version(), **versions},
                 "device": str(jax.devices()[0].device_kind),
                 "commit": _commit(),
@@ -194,6 +196,8 @@ class RunDir:
                 f"{self.path} holds a run with other settings ({'; '.join(found)}); choose another"
                 " --run-dir, or the same settings to resume, perhaps with more iterations."
             )
+        if config.collection.check:
+            self.refuse_changed()
         if longer:
             self._lengthen(wanted)
         self.check()
@@ -218,6 +222,26 @@ class RunDir:
             f"{path} has schema {str(values['schema'])[:20]}, allowed: {SCHEMA}; train the run"
             " again, or use the version of headway that made it."
         )
+
+    def environment_changes(self) -> list[str]:
+        """One line per difference of an own environment to what it was when the run was begun."""
+        with reading(self.path / "config.json"):
+            begun = json.loads((self.path / "config.json").read_bytes()).get("environment")
+        return changes(begun or {}, self.config())
+
+    def refuse_changed(self) -> None:
+        """Make sure that an own environment is what it was when the run was begun, if it was.
+
+        Raises:
+            RunError: It is not.
+        """
+        found = self.environment_changes() if (self.path / "config.json").exists() else []
+        if found:
+            raise RunError(
+                f"{self.path} holds a run of its environment before that changed"
+                f" ({'; '.join(found)}); choose another --run-dir, undo the change, or go on with"
+                " both in one run by --collection.no-check."
+            )
 
     @property
     def finished_iterations(self) -> int:

@@ -15,6 +15,8 @@ from headway.config import Config, override
 from headway.data import Trajectory
 from headway.errors import DivergenceError
 from headway.models.fitting import EpochStats
+from headway.task import BUILT_IN
+from headway.training.check import refuse_faults
 from headway.training.collect import (
     Batches,
     Environments,
@@ -77,6 +79,9 @@ def train_run(
     """
     run = RunDir(run_dir)
     _forget_programs()
+    if config.collection.check and config.env not in BUILT_IN:
+        run.refuse_changed()
+        refuse_faults(config)
     # A display begins once it is certain that the run does.
     with run.locked(), progress or Progress() as shown, stop_requests() as stop:
         if resume_from_last_good:

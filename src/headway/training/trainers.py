@@ -3,6 +3,7 @@
 Adaptive baselines: learning_to_adapt, `meta_mlp_dynamics.py` (GrBAL) and `rnn_dynamics.py` (ReBAL).
 """
 
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
@@ -378,7 +379,7 @@ def load_agent(
     environments: Environments | None = None,
     iteration: Iteration = None,
 ) -> Agent:
-    """The agent of a run, as it was after an iteration.
+    """The agent of a run, as it was after an iteration; warns if its environment changed since.
 
     Args:
         run: The run.
@@ -391,6 +392,12 @@ def load_agent(
         ConfigError: It is a run on the true dynamics, and there are no environments.
     """
     config = config or run.config()
+    changed = run.environment_changes()
+    if changed:
+        warnings.warn(
+            f"{run.path} was trained on {config.env} as it was before ({'; '.join(changed)}).",
+            stacklevel=2,
+        )
     trainer = make_trainer(config, environments)
     number = run.kept_iteration(iteration)
     state = trainer.load(run, number)

@@ -1,0 +1,320 @@
+"""The contract between an environment and its Task, looked at within seconds."""
+
+import dataclasses
+import re
+from collections.abc import Iterator
+from contextlib import closing
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from headway.config import Config, override
+from headway.data import Trajectory
+from headway.errors import BadEnvironmentError, HeadwayError, did_you_mean
+from headway.models.compilation import prepare_jax
+from headway.task import EnvSpec, Task, register
+from headway.training.collect import Environments, Episode, random_policy, run_episodes
+from headway.training.methods import make_config
+
+TRANSITIONS = 200  # of one long episode, and about as many of short ones under all physics
+LONGEST = 500  # steps in which a sim_param must show
+BIG = 1000.0  # below, float32 resolves what happens in a step
+_REASONS = (
+    (jax.errors.TracerBoolConversionError, "an `if`, `and` or `max` on numbers; use jnp.where"),
+    (jax.errors.TracerArrayConversionError, "a call of NumPy; use jax.numpy"),
+    (jax.errors.ConcretizationTypeError, "float(), int() or math; use jax.numpy"),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """One thing in which an environment and its Task were looked at."""
+
+    name: str
+    """The thing."""
+    status: Literal["ok", "fault", "remark"]
+    """A fault makes a run wrong; a remark does not."""
+    text: str
+    """Why, and what to do."""
+
+
+def check(env: str | EnvSpec) -> list[Finding]:
+    """Compare an environment with its Task, in random transitions under physics of every group.
+
+    Before an environment of your own is trained on, `headway.train` does the same.
+
+    Args:
+        env: Short name or id of an environment, or an EnvSpec, which is registered by its name.
+
+    Returns:
+        The rows of the table of `headway check ENV`.
+
+    Raises:
+        UnknownNameError: No such environment.
+        ConfigError: The EnvSpec has the name of a built-in environment.
+    """
+    prepare_jax()
+    if isinstance(env, EnvSpec):
+        register(env)
+        env = env.name
+    return list(findings(make_config(env)))
+
+
+def refuse_faults(config: Config) -> None:
+    """Check the environment of a run that is about to be trained.
+
+    Raises:
+        BadEnvironmentError: There is a fault.
+    """
+    faults = [finding for finding in findings(config) if finding.status == "fault"]
+    if faults:
+        more = f" {len(faults) - 1} more." if faults[1:] else ""
+        raise BadEnvironmentError(
+            f"{config.env} and its Task, {faults[0].name}: {faults[0].text}{more} `headway check"
+            f" {config.env}` or headway.check shows all; --collection.no-check goes on anyway."
+        )
+
+
+def findings(config: Config) -> Iterator[Finding]:
+    """Look at the environment of a run; nothing is stepped before the Task can be traced."""
+    try:
+        environments = Environments.make(override(config, {"collection.num_episodes": 1}))
+    except Exception as error:  # whatever the environment does while it is made
+        text = " ".join(str(error).split())
+        if not isinstance(error, HeadwayError):
+            text = f"Making it raised {type(error).__name__}: {text}"
+        yield Finding("environment", "fault", text)
+        return
+    with closing(environments):
+        found = [_finding("action bounds", _bounds(environments))]
+        if found[0].status == "ok":
+            found += _methods(environments.task)
+        yield from found
+        if any(finding.status == "fault" for finding in found):
+            yield Finding("transitions", "remark", "Not looked at before this is mended.")
+            return
+        try:
+            yield from _Trials(environments).findings(config.collection.max_bad_episodes)
+        except HeadwayError as error:
+            yield Finding("transitions", "fault", str(error))
+
+
+def _finding(name: str, fault: str) -> Finding:
+    return Finding(name, "fault" if fault else "ok", fault)
+
+
+def _bounds(environments: Environments) -> str:
+    """Say what is wrong with the bounds of actions, if anything is."""
+    task, space = environments.task, environments.vector.single_action_space
+    mine = np.array([task.action_low, task.action_high], np.float64)
+    theirs = np.array([getattr(space, "low", mine[0]), getattr(space, "high", mine[1])])
+    told = f"action_low is {task.action_low} and action_high {task.action_high}, allowed: "
+    if mine.shape != theirs.shape or not np.isfinite(mine).all() or (mine[0] >= mine[1]).any():
+        return f"{told}finite numbers, low below high, for each action."
+    if not np.isclose(mine, np.where(np.isfinite(theirs), theirs, mine), rtol=1e-6).all():
+        return f"{told}the environment's bounds, {_short(theirs[0])} and {_short(theirs[1])}."
+    return ""
+
+
+def _methods(task: Task) -> Iterator[Finding]:
+    """Trace the methods of a Task for 6 transitions."""
+    rng = np.random.default_rng(0)
+    obs, next_obs = jnp.asarray(rng.normal(size=(2, 6, task.obs_size)), jnp.float32)
+    action = jnp.asarray(rng.uniform(-1, 1, (6, task.action_size)), jnp.float32)
+    action = task.scale_action(action)
+    row: tuple[int, ...] = (task.obs_size,)
+    for name, shape, *rows in (
+        ("reward", (), obs, action, next_obs),
+        ("terminated", (), obs, action, next_obs),
+        ("preprocess", None, obs),
+        ("target", row, obs, next_obs),
+        ("postprocess", row, obs, next_obs),
+    ):
+        yield _finding(f"Task.{name}", _traced(task, name, shape, rows))
+
+
+def _traced(task: Task, name: str, shape: tuple[int, ...] | None, rows: list[Any]) -> str:
+    """Say what is wrong with a method of a Task, if anything is.
+
+    Args:
+        task: The Task.
+        name: Of the method.
+        shape: Of its result for one transition; None for a row of any size.
+        rows: Its arguments for 6 transitions.
+    """
+    method = getattr(task, name)
+
+    def both(*rows):
+        return jax.vmap(method)(*rows), jnp.asarray(method(*(x.reshape(3, 2, -1) for x in rows)))
+
+    try:
+        single, batch = jax.jit(both)(*rows)
+    except Exception as error:  # whatever the method does
+        text = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        text = next((words for kind, words in _REASONS if isinstance(error, kind)), text)
+        return f"JAX cannot trace it with leading axes: {text}."
+    got = single.shape[1:]
+    if len(got) != 1 if shape is None else got != shape:
+        allowed = "a row of numbers" if shape is None else shape
+        text = f"It returns shape {got} for one transition, allowed: {allowed}; take"
+        return f"{text} a number by [..., 0], several by [..., :1]."
+    same = batch.shape == (3, 2, *got)
+    if not (same and np.allclose(batch.reshape(6, *got), single, 1e-4, 1e-4, equal_nan=True)):
+        text = f"It returns shape {batch.shape} or other numbers for leading axes (3, 2) than"
+        return f"{text} one by one; index with [..., i], and sum over axis=-1 only."
+    if name == "terminated" and batch.dtype != bool:
+        return f"It returns {batch.dtype}, allowed: bool, as next_obs[..., 0] > 1 is."
+    return ""
+
+
+@dataclasses.dataclass
+class _Trials:
+    """Random episodes under physics of every group, and what they show."""
+
+    environments: Environments
+    taken: list[Trajectory] = dataclasses.field(default_factory=list)
+    raw: list[np.ndarray] = dataclasses.field(default_factory=list)
+    """Their observations in the environment's own type, without the last one."""
+    broken: list[str] = dataclasses.field(default_factory=list)
+    """Why the other episodes are left out."""
+    told: dict[str, list[tuple[Any, Any]]] = dataclasses.field(default_factory=dict)
+    """What was asked for, and what `reset` told, by name of the parameter."""
+
+    def act(self, physics: dict[str, float], steps: int, seed: int = 0) -> np.ndarray | None:
+        """Run an episode; its observations, or None if it broke."""
+        random, raw = random_policy(self.environments, np.random.default_rng(seed)), []
+
+        def policy(obs):
+            raw.append(obs[0].astype(np.float64))
+            return random(obs)
+
+        environments = dataclasses.replace(self.environments, episode_length=steps)
+        rollout = run_episodes(environments, [Episode(physics, seed)], policy)
+        for name, value in getattr(environments.vector, "told", [physics])[0].items():
+            self.told.setdefault(name, []).append((physics.get(name), value))
+        self.broken += rollout.invalid.values()
+        if 0 not in rollout.episodes:
+            return None
+        self.taken.append(rollout.episodes[0])
+        self.raw.append(np.array(raw))
+        return rollout.episodes[0].obs
+
+    def findings(self, max_broken: int) -> Iterator[Finding]:
+        """Look at everything; so many episodes may break."""
+        import gymnasium  # a controller is loaded without it
+
+        for env in getattr(self.environments.vector, "envs", ()):
+            if isinstance(env, gymnasium.Env):  # and not in a process of its own
+                yield from _wrappers(env)
+        sets = self.environments.sim_params
+        steps = max(10, TRANSITIONS // (2 * len(sets.group_names) * len(sets.names)))
+        first = sets.group("train")[0]
+        before = self.act(first, TRANSITIONS)
+        params = [self.sim_param(name, steps) for name in sets.names]
+        after = self.act(first, steps)
+        same = before is None or after is None or np.allclose(before[: len(after)], after)
+        text = "The same seed, sim_params and actions gave another episode than before; draw from"
+        text += " self.np_random after super().reset(seed=seed), and let nothing stay of others."
+        yield from (_finding("repeats", "" if same else text), *params)
+        if self.broken:
+            text = f"{len(self.broken)} broke, allowed: {max_broken} (collection.max_bad_episodes);"
+            fault = not self.taken or len(self.broken) > max_broken
+            text += f" the first: {self.broken[0]}."
+            yield Finding("episodes", "fault" if fault else "remark", text)
+        if self.taken:
+            yield from _compared(self.environments.task, self.taken)
+            yield _finding("numbers", _unresolved(self.raw))
+
+    def sim_param(self, name: str, steps: int) -> Finding:
+        """Say whether a parameter changes observations in every group, and what `reset` told."""
+        sets = self.environments.sim_params
+        known = {row[name] for group in sets.group_names for row in sets.group(group)}
+        if len(known) == 1:
+            return Finding(name, "remark", "It has one value, so nothing shows that it is applied.")
+        for start, group in enumerate(sets.group_names):
+            first, *rest = sets.group(group)
+            values = {row[name] for row in rest} - {first[name]} or known - {first[name]}
+            # The nearest value, so that a range that the environment stops at is noticed.
+            other = first | {name: min(values, key=lambda value: abs(value - first[name]))}
+            for more, length in enumerate((steps, LONGEST, LONGEST)):
+                seed = start + more * len(sets.group_names)
+                one, two = self.act(first, length, seed), self.act(other, length, seed)
+                if one is None or two is None or not np.array_equal(one, two):
+                    break
+            else:
+                text = f"It changes no observation in group {group}, be it {first[name]:g} or"
+                text += f" {other[name]:g}; see that `reset` applies options['sim_params'] by this"
+                text += " name, and that no wrapper drops the options."
+                hint = did_you_mean(name, {*self.told} - {*sets.names})
+                return Finding(name, "fault", text + hint)
+        for asked, told in self.told.get(name, ()):
+            if not np.isclose(asked, told, rtol=1e-5):
+                return _finding(name, f"Asked for {asked:g}, info['sim_params'] says {told:g}.")
+        if name not in self.told:
+            return Finding(name, "remark", "info['sim_params'] does not say what was applied.")
+        return _finding(name, "")
+
+
+def _compared(task: Task, taken: list[Trajectory]) -> Iterator[Finding]:
+    """Compare the Task's numbers with the environment's."""
+    ended = np.concatenate([np.arange(1, len(t) + 1) == len(t) * t.terminated for t in taken])
+    rows = [(t.obs[:-1], t.action, t.obs[1:], t.reward) for t in taken]
+    obs, action, next_obs, paid = map(np.concatenate, zip(*rows, strict=True))
+    action = np.asarray(task.scale_action(jnp.asarray(action)))
+    physics = [dict(t.sim_params) for t in taken for _ in range(len(t))]
+
+    @jax.jit
+    def numbers(obs, action, next_obs):
+        rows, back = (obs, action, next_obs), task.postprocess(obs, task.target(obs, next_obs))
+        return task.reward(*rows), task.terminated(*rows), back, task.preprocess(obs)
+
+    reward, ends, back, features = map(np.asarray, numbers(obs, action, next_obs))
+    # What the last bit of an observation decides is nobody's fault.
+    nudged = np.nextafter(obs, np.float32(np.inf)), action, np.nextafter(next_obs, -np.float32(1e9))
+    other_reward, other_ends, *_ = numbers(*nudged)
+    rounding = 8 * np.abs(other_reward - reward)
+    size = 1e-3 * np.maximum(np.abs(paid), np.median(np.abs(paid))) + 1e-9
+    scale = 1e-4 * np.maximum(np.abs(obs), np.abs(next_obs)).max(0) + 1e-6
+    finite = np.isfinite(features).all(1)
+    for name, error, mine, theirs in (
+        ("reward", np.abs(reward - paid) / (size + rounding), reward, paid),
+        ("terminated", 2.0 * ((ends != ended) & (other_ends != ended)), ends, ended),
+        ("preprocess", 2.0 * ~finite, features, len(obs) * ["finite"]),
+        ("postprocess", (np.abs(back - next_obs) / scale).max(1), back, next_obs),
+    ):
+        bad, row = ~(error <= 1), np.argmax(np.nan_to_num(error, nan=np.inf))  # NaN is bad
+        text = f"Task.{name} is {_short(mine[row])}, allowed: {_short(theirs[row])} as in the"
+        text += f" environment; so in {bad.sum()} of {len(obs)} transitions, worst at obs"
+        text += f" {_short(obs[row])}, action {_short(action[row])}, next_obs"
+        text += f" {_short(next_obs[row])} under {physics[row]}."
+        if not np.isfinite(mine[row]).all():
+            text = f"Not finite: {text}"
+        yield _finding(name, text if bad.any() else "")
+
+
+def _unresolved(raw: list[np.ndarray]) -> str:
+    """Say which observation changes less in a step than float32, of all models, resolves."""
+    size = np.abs(np.concatenate(raw)).max(0).astype(np.float32)
+    change = np.concatenate([np.zeros((1, len(size))), *(np.abs(np.diff(o, axis=0)) for o in raw)])
+    change, finest = change.mean(0), np.spacing(size)
+    for i in np.flatnonzero((size > BIG) & (change > 0) & (change < 16 * finest)):
+        text = f"obs[{i}] is up to {size[i]:.3g} and changes by {change[i]:.2g} in a step, of which"
+        return f"{text} float32 resolves {finest[i]:.2g}; subtract a constant in a wrapper."
+    return ""
+
+
+def _wrappers(env: Any) -> Iterator[Finding]:
+    """Name wrappers with running statistics; say whether physics can change in an episode."""
+    found = re.findall(r"Normalize(?:Observation|Reward)", str(env))
+    text = f"{' and '.join(found)} keep running statistics, so that equal numbers mean different"
+    text += " things as a run goes on; leave them out, models normalise by themselves."
+    yield _finding("wrappers", text if found else "")
+    if not env.has_wrapper_attr("set_sim_params"):
+        text = "There is no set_sim_params(values): physics stay during an episode."
+        yield Finding("schedule", "remark", text)
+
+
+def _short(numbers: Any) -> str:
+    return np.array2string(np.asarray(numbers), precision=6, separator=", ", threshold=8)

@@ -1,0 +1,88 @@
+"""What of an environment of your own decides a run's numbers: its settings and its source."""
+
+import hashlib
+import importlib.util
+import inspect
+import json
+import sys
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+
+from headway.config import Config, flatten
+from headway.errors import shown
+from headway.task import BUILT_IN, env_options, env_spec, episode_length, sim_param_sets
+
+SOURCE = "source."
+STDLIB = Path(inspect.__file__).parent
+
+
+def identity(config: Config) -> dict[str, Any]:
+    """Describe an environment of your own, for JSON; nothing for a built-in one.
+
+    Of the source it has the modules of the EnvSpec, of the Task and of the environment, with
+    their base classes; what is installed is left out. Where Gymnasium is not loaded, as in a
+    controller, the environment itself is not known.
+    """
+    if config.env in BUILT_IN:
+        return {}
+    spec, options = env_spec(config.env), env_options(config)
+    task, environment = spec.make_task(**options), _environment(spec.env_id)
+    owners = [*type(task).__mro__, *getattr(environment, "__mro__", [environment])]
+    modules = {config.env.partition(":")[0], *(str(owner.__module__) for owner in owners if owner)}
+    found = {
+        "task": f"{type(task).__module__}.{eqx.tree_pformat(task, short_arrays=False)}",
+        "environment": environment and f"{environment.__module__}.{environment.__qualname__}",
+        "sim_params": sim_param_sets(config).to_dict(),
+        "episode_length": episode_length(config),
+        "options": options,
+        "source": {name: _digest(file) for name in sorted(modules) if (file := _file(name))},
+    }
+    return json.loads(json.dumps(found))
+
+
+def changes(before: Mapping[str, Any], config: Config) -> list[str]:
+    """Return one line per difference of an environment to what `identity` said of it.
+
+    What cannot be known here, such as a module that is not there, is not compared.
+    """
+    old, new = flatten(before), flatten(identity(config) if before else {})
+    lines = []
+    for name in sorted({*old, *new}):
+        was, now, module = old.get(name), new.get(name), name.removeprefix(SOURCE)
+        if module == name and was != now and (name != "environment" or (was and now)):
+            lines.append(f"{name}: {shown(was)} -> {shown(now)}")
+        elif module != name and (file := _file(module)) and was not in (None, _digest(file)):
+            lines.append(f"source of {module} changed: {file.name}")
+    return lines
+
+
+def _environment(env_id: Any) -> Any:
+    """The class or function that makes an environment; None where it is not known."""
+    gymnasium = sys.modules.get("gymnasium")
+    found = gymnasium and gymnasium.registry.get(env_id)
+    entry = found.entry_point if found else env_id
+    if isinstance(entry, str):
+        module, _, name = entry.partition(":")
+        entry = getattr(sys.modules.get(module), name, None)
+    entry = getattr(entry, "func", entry)  # of a functools.partial
+    return entry if hasattr(entry, "__qualname__") else None
+
+
+def _file(module: str) -> Path | None:
+    """The file of a module of the user's own; None where it is installed or has none."""
+    found = getattr(sys.modules.get(module), "__file__", None)
+    if module not in sys.modules:
+        with suppress(Exception):  # whatever its package does while it is imported
+            found = getattr(importlib.util.find_spec(module), "origin", None)
+    path = Path(found or "")
+    installed = {"site-packages", "dist-packages"} & {*path.parts} or path.is_relative_to(STDLIB)
+    own = not installed and module.partition(".")[0] != "headway"
+    return path if own and path.is_file() else None
+
+
+def _digest(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
