@@ -118,3 +118,21 @@ class Drift(gymnasium.Env):
 
     def change_actions(self):
         self.action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+
+
+class Drawn(Drift):
+    """It can be drawn."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(self, how="", render_mode=None):
+        super().__init__(how)
+        self.render_mode = render_mode
+
+    def render(self):
+        return np.zeros((8, 8, 3), np.uint8)
+
+
+def wrapped(**options):
+    """Pays 7 whatever happens."""
+    return gymnasium.wrappers.TransformReward(Drawn(**options), lambda reward: 0 * reward + 7.0)

@@ -109,7 +109,7 @@ def test_wrong_usage_exits_2_and_says_what_there_is(capsys, calls, words, text):
         ("train pendulm --help", "Did you mean 'pendulum'?"),
         ("train pendulum --method tmlc", "Did you mean 'tmcl'?"),
         ("train pendulum --preset quik", "Did you mean 'quick'?"),
-        ("train pendulum --env-options nothing=maybe", "nothing=on or =off"),
+        ("train hopper --env-options scale-inertia", "allowed: NAME=VALUE"),
         ("train pendulum --sim-params missing.json", "missing.json"),
         ("evaluate nowhere --json", "allowed: a run directory"),
         ("plot-dynamics pendulum --num-states 0", "--num-states is 0, allowed: "),
@@ -149,6 +149,9 @@ def test_settings_are_those_that_differ_from_the_preset():
     assert asked("pendulum", "--model.no-backward-net") == {"model.backward_net": False}
     switched = asked("hopper", "--env-options", "scale-inertia=on")
     assert switched["env_options"] == {"scale_inertia": True}
+    words = ["gain=-2.0", "a-b=x-y", "sizes=[1,2]", 'table={"k":null}', 'text="on"']
+    wanted = {"gain": -2.0, "a_b": "x-y", "sizes": [1, 2], "table": {"k": None}, "text": "on"}
+    assert asked("pendulum", "--env-options", *words)["env_options"] == wanted
 
 
 def test_physics_from_a_file(capsys, tmp_path):

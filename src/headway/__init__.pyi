@@ -31,6 +31,7 @@ from .planning.optimizers import ICEM as ICEM
 from .planning.optimizers import MPPI as MPPI
 from .planning.optimizers import RandomShooting as RandomShooting
 from .sim_params import SimParamSets as SimParamSets
+from .sim_params import Uniform as Uniform
 from .task import EnvSpec as EnvSpec
 from .task import Task as Task
 from .task import env_spec as env_spec

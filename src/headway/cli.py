@@ -139,7 +139,7 @@ class Train(Command):
     sim_params: Annotated[Path | None, _unless_given("the environment's own")] = None
     """A JSON file with the training and unseen physics."""
     env_options: Annotated[tuple[str, ...], _unless_given("those of the preset")] = ()
-    """Switches of the environment: NAME=on or NAME=off."""
+    """Options of the environment as NAME=VALUE; switches are on or off, lists and tables JSON."""
     resume_from_last_good: Flag = False
     """If a file of the run is damaged, go back to the newest iteration that is intact."""
     model: ModelConfig = MultiHeadedConfig()
@@ -167,10 +167,11 @@ class Train(Command):
         if self.env_options:
             options = dict(config.env_options)
             for word in self.env_options:
-                name, _, value = word.replace("-", "_").partition("=")
-                if value not in ("on", "off"):
-                    raise ConfigError(f"--env-options is {word!r}, allowed: {name}=on or =off.")
-                options[name] = value == "on"
+                name, _, text = word.partition("=")
+                value = {"on": True, "off": False}.get(text, _json_or_text(text))
+                if value == "":
+                    raise ConfigError(f"--env-options is {word!r}, allowed: NAME=VALUE.")
+                options[name.replace("-", "_")] = value
             settings["env_options"] = options
         if self.sim_params is not None:
             try:
@@ -529,7 +530,7 @@ class List(Command):
                 groups = {name: list(map(dict, sets.group(name))) for name in sets.group_names}
                 entry = {
                     "name": spec.name,
-                    "id": spec.env_id,
+                    "id": str(spec.env_id),
                     "description": spec.description,
                     **{name: getattr(task, name, None) for name in ("obs_size", "action_size")},
                     "episode_length": spec.episode_length,
@@ -764,10 +765,9 @@ def _json_or_text(word: str) -> Any:
 
 
 def _physics(words: Sequence[str], option: str) -> dict[str, float]:
-    """Read `length=0.5 mass=2`."""
-    from headway.training.run import parse_sim_params
-
+    """Read `length=0.5` and `mass=2`; a name may hold blanks and further equals signs."""
+    pairs = [word.rpartition("=") for word in words]
     try:
-        return parse_sim_params(" ".join(words))
+        return {name: float(value) for name, _, value in pairs}
     except ValueError as error:
-        raise ConfigError(f"{option}: {error}.") from None
+        raise ConfigError(f"{option}: {error}, allowed: NAME=NUMBER, as in length=0.5.") from None

@@ -451,8 +451,8 @@ class Config:
     """Name of the preset the settings started from."""
     seed: Annotated[int, Field(strict=True, ge=0, le=2**31 - 1)] = 0
     """Seeds environments, physics, initial weights, batches and planner."""
-    env_options: Mapping[str, Flag] = dataclasses.field(default_factory=dict)
-    """Switches of the environment that differ from its defaults."""
+    env_options: Mapping[str, pydantic.JsonValue] = dataclasses.field(default_factory=dict)
+    """Options of the environment that differ from its defaults."""
     sim_params: Annotated[SimParamSets | None, pydantic.PlainValidator(_sim_params)] = None
     """Training and unseen simulator parameters; None takes the environment's own."""
     spaces: Spaces | None = None

@@ -11,10 +11,43 @@ import numpy as np
 
 from headway.errors import ConfigError, shown, unknown_name
 
-Values = Mapping[str, tuple[float, ...]]
-
 MAX_COMBINATIONS = 100_000
 """Physics that one group may stand for."""
+QUANTILES = 5
+"""Values that stand for a range where physics are counted or listed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Uniform:
+    """A range of a parameter's values, from which training draws evenly; in JSON a table.
+
+    Tests go through evenly spaced values of it, both ends among them.
+
+    Example:
+        >>> sets = SimParamSets({"mass": Uniform(0.5, 2.5)})
+        >>> sets.spread("train", 3)
+        [{'mass': 2.5}, {'mass': 1.5}, {'mass': 0.5}]
+
+    Raises:
+        ConfigError: An end is no finite number, or they are not in order.
+    """
+
+    low: float
+    """Its least value."""
+    high: float
+    """Its largest value."""
+
+    def __post_init__(self) -> None:
+        if not (_is_finite(self.low) and _is_finite(self.high) and self.low < self.high):
+            raise ConfigError(
+                f"Uniform is from {shown(self.low)} to {shown(self.high)}, allowed: finite"
+                " numbers, the lower one first."
+            )
+        for name in ("low", "high"):
+            object.__setattr__(self, name, float(getattr(self, name)))
+
+
+Values = Mapping[str, tuple[float, ...] | Uniform]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +68,7 @@ class SimParamSets:
     """
 
     train: Values
-    """Values of each parameter during training: a tuple, a list or an array."""
+    """Values of each parameter during training: a tuple, list, range or array, or a `Uniform`."""
     unseen: Mapping[str, Values] = dataclasses.field(default_factory=dict)
     """Values of each parameter in each group of test physics, by the group's name."""
 
@@ -68,35 +101,48 @@ class SimParamSets:
 
     def sample(self, rng: np.random.Generator) -> dict[str, float]:
         """Draw each parameter uniformly and independently from its training values."""
-        return {name: values[rng.integers(len(values))] for name, values in self.train.items()}
+        return {
+            name: float(rng.uniform(values.low, values.high))
+            if isinstance(values, Uniform)
+            else values[rng.integers(len(values))]
+            for name, values in self.train.items()
+        }
+
+    def nearest(self, sim_params: Mapping[str, float]) -> dict[str, float]:
+        """Return the training physics of `group` that drawn ones are counted with."""
+        return {
+            name: min(_column(self.train[name]), key=lambda one: abs(one - value))
+            for name, value in sim_params.items()
+        }
 
     def group(self, name: str) -> list[dict[str, float]]:
-        """Return every combination of a group's values.
+        """Return every combination of a group's values; quantiles stand for a range.
 
         Raises:
             UnknownNameError: There is no such group.
         """
         values = self._values(name)
-        return [dict(zip(values, row, strict=True)) for row in itertools.product(*values.values())]
+        columns = map(_column, values.values())
+        return [dict(zip(values, row, strict=True)) for row in itertools.product(*columns)]
 
     def spread(self, name: str, count: int) -> list[dict[str, float]]:
         """Return so many physics of a group, with every value of a parameter equally often.
 
-        All combinations in turn if there are not more than `count`. Else a Latin hypercube:
-        each parameter goes evenly through its values, in an order of its own that is always the
-        same.
+        All combinations in turn if there are not more than `count`. Else, and where there is a
+        range, a Latin hypercube: each parameter goes evenly through its values, in an order of
+        its own that is always the same.
 
         Raises:
             UnknownNameError: There is no such group.
         """
-        combinations = self.group(name)
-        if count >= len(combinations):
+        combinations, values = self.group(name), self._values(name)
+        ranges = any(isinstance(column, Uniform) for column in values.values())
+        if count >= len(combinations) and not ranges:
             return [combinations[i % len(combinations)] for i in range(count)]
-        rng = np.random.default_rng(0)
-        columns = {
-            key: np.array(column)[rng.permutation(np.arange(count) * len(column) // count)]
-            for key, column in self._values(name).items()
-        }
+        rng, columns = np.random.default_rng(0), {}
+        for key, column in values.items():
+            given = np.array(_column(column, count))
+            columns[key] = given[rng.permutation(np.arange(count) * len(given) // count)]
         return [{key: float(column[i]) for key, column in columns.items()} for i in range(count)]
 
     def _values(self, name: str) -> Values:
@@ -123,7 +169,15 @@ class SimParamSets:
         return cls(**values)
 
 
-def _checked(where: str, values: Any) -> dict[str, tuple[float, ...]]:
+def _column(values: tuple[float, ...] | Uniform, count: int = QUANTILES) -> tuple[float, ...]:
+    """Return all values of a parameter; of a range so many, both ends or else its middle."""
+    if not isinstance(values, Uniform):
+        return values
+    low = values.low if count > 1 else (values.low + values.high) / 2
+    return tuple(np.linspace(low, values.high, count).tolist())
+
+
+def _checked(where: str, values: Any) -> Values:
     """Return a group's values as tuples; refuse anything but some finite numbers by name."""
     if not isinstance(values, Mapping) or not values:
         raise ConfigError(
@@ -133,13 +187,19 @@ def _checked(where: str, values: Any) -> dict[str, tuple[float, ...]]:
     checked = {}
     for name, given in values.items():
         column = given.tolist() if isinstance(given, np.ndarray) else given
-        if not isinstance(column, list | tuple) or not column or not all(map(_is_finite, column)):
+        if isinstance(column, Mapping) and set(column) == {"low", "high"}:
+            column = Uniform(**column)
+        if isinstance(column, Uniform):
+            checked[name] = column
+            continue
+        listed = isinstance(column, list | tuple | range) and column
+        if not listed or not all(map(_is_finite, column)):
             raise ConfigError(
                 f"sim_params {where}, {str(name)[:80]}, is {shown(column)}, allowed: one or more"
-                " finite numbers."
+                " finite numbers, or a range {'low': number, 'high': number}."
             )
         checked[name] = tuple(map(float, column))
-    if math.prod(map(len, checked.values())) > MAX_COMBINATIONS:
+    if math.prod(len(_column(column)) for column in checked.values()) > MAX_COMBINATIONS:
         raise ConfigError(
             f"sim_params {where} has too many combinations of values, allowed: at most"
             f" {MAX_COMBINATIONS:,}."

@@ -5,6 +5,7 @@ import copy
 import dataclasses
 import functools
 import importlib
+import json
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from headway.errors import ConfigError, unknown_name
+from headway.errors import ConfigError, shown, unknown_name
 from headway.sim_params import SimParamSets
 from headway.spaces import Spaces
 
@@ -149,8 +150,9 @@ class EnvSpec:
 
     name: str
     """Short name, as the command line takes it."""
-    env_id: str
-    """Gymnasium id; any id that `gymnasium.make` knows."""
+    env_id: str | Callable[..., Any]
+    """Any id that `gymnasium.make` takes, also `"module:Env-v0"`; or what makes the environment,
+    a class or a function. It takes the options as keywords and, to be filmed, `render_mode`."""
     make_task: Callable[..., Task]
     """Builds the Task; takes the options as keywords."""
     sim_params: SimParamSets
@@ -159,8 +161,8 @@ class EnvSpec:
     """Steps after which an episode is cut."""
     default_sim_params: Mapping[str, float]
     """The physics of the unchanged environment."""
-    options: Mapping[str, bool] = dataclasses.field(default_factory=dict)
-    """Boolean options of the environment and its Task, with their defaults."""
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Options of the environment and its Task, with their defaults; anything that JSON holds."""
     description: str = ""
     """One line for lists."""
     epochs: int = 50
@@ -180,6 +182,13 @@ class EnvSpec:
                 f" allowed: a name, at least 1 each, and its sim_params,"
                 f" {sorted(self.sim_params.names)}."
             )
+        try:
+            json.dumps(dict(self.options), allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(
+                f"environment {self.name!r} has options {shown(self.options)} ({error}), allowed:"
+                " what JSON holds: numbers, texts, true, false, null, lists and tables of them."
+            ) from None
 
 
 _HOMES = {
@@ -231,7 +240,8 @@ def env_spec(name: str) -> EnvSpec:
         return _imported(_HOMES[name])
     if name in _registered:
         return _registered[name]
-    by_id = {spec.env_id: spec for spec in map(env_spec, reversed(env_names()))}
+    specs = map(env_spec, reversed(env_names()))
+    by_id = {spec.env_id: spec for spec in specs if isinstance(spec.env_id, str)}
     if name in by_id:
         return by_id[name]
     if ":" in name:
@@ -269,16 +279,21 @@ def episode_length(config: "Config") -> int:
     return config.collection.episode_length or env_spec(config.env).episode_length
 
 
-def env_options(config: "Config") -> dict[str, bool]:
+def env_options(config: "Config") -> dict[str, Any]:
     """All options of a run's environment: its own over the defaults.
 
     Raises:
-        ConfigError: The environment has no such option.
+        ConfigError: The environment has no such option, or it is a switch.
     """
     spec = env_spec(config.env)
-    for option in config.env_options:
+    for option, value in config.env_options.items():
         if option not in spec.options:
             raise ConfigError(str(unknown_name(f"{spec.name} option", option, spec.options)))
+        if isinstance(spec.options[option], bool) and not isinstance(value, bool):
+            raise ConfigError(
+                f"{spec.name} option {option} is {shown(value)}, allowed: True or False (on the"
+                " command line on or off)."
+            )
     return {**spec.options, **config.env_options}
 
 

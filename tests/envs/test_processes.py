@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -127,6 +128,8 @@ def test_what_an_environment_raises_arrives_and_its_process_goes_on(how, says, m
     assert pids(vector) == before
     with pytest.raises(ConfigError, match="step_timeout_s"):
         made(timeout_s=0.0)
+    with pytest.raises(ConfigError, match=r"cannot be sent to a process .*cannot pickle"):
+        made(threading.Lock())
 
 
 PARENT = """

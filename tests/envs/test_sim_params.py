@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from headway.errors import ConfigError, UnknownNameError
-from headway.sim_params import SimParamSets
+from headway.sim_params import SimParamSets, Uniform
 
 SETS = SimParamSets(
     {"mass": (1.0, 2.0), "length": (0.5, 3.0)},
@@ -29,6 +29,22 @@ def test_values_may_be_lists_and_numpys_arrays_and_numbers():
     sets = SimParamSets(train, {"low": {"mass": [0.1, 0.2], "length": (np.float64(0.5),)}})
     assert sets == SETS
     assert {type(value) for group in sets.group("train") for value in group.values()} == {float}
+    assert SimParamSets({"leg": range(3)}).train == {"leg": (0.0, 1.0, 2.0)}
+
+
+def test_ranges_are_drawn_from_evenly_and_tested_evenly():
+    given = {"mass": Uniform(np.float32(0.5), 2), "leg": (0, 1)}
+    sets = SimParamSets(given, {"low": {"mass": {"low": 0, "high": 0.5}, "leg": [2]}})
+    rng = np.random.default_rng(0)
+    draws = np.sort([sets.sample(rng)["mass"] for _ in range(2000)])
+    np.testing.assert_allclose(draws, np.linspace(0.5, 2, 2000), atol=0.05)
+    spread = sets.spread("train", 6)
+    assert sorted(one["mass"] for one in spread) == pytest.approx(np.linspace(0.5, 2, 6))
+    assert [one["leg"] for one in spread].count(1.0) == 3
+    assert sets.spread("low", 1) == [{"mass": 0.25, "leg": 2.0}]
+    assert len(sets.group("train")) == 10
+    assert sets.nearest({"mass": 0.6, "leg": 1.0}) == {"mass": 0.5, "leg": 1.0}
+    assert SimParamSets.from_dict(json.loads(json.dumps(sets.to_dict()))) == sets
 
 
 @pytest.mark.parametrize(
@@ -42,6 +58,10 @@ def test_values_may_be_lists_and_numpys_arrays_and_numbers():
         {"train": {"mass": ["1"]}},
         {"train": {"mass": [True]}},
         {"train": {"mass": np.ones((2, 2))}},
+        {"train": {"mass": range(0)}},
+        {"train": {"mass": {"low": 1.0}}},
+        {"train": {"mass": {"low": 2.0, "high": 1.0}}},
+        {"train": {"mass": {"low": 2.0, "high": float("inf")}}},
         {"train": {"mass": [1.0]}, "unsen": {}},
         {"train": {"mass": [1.0]}, "unseen": [1]},
         {"train": {"mass": [1.0]}, "unseen": {"train": {"mass": [1.0]}}},

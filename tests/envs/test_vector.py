@@ -11,9 +11,9 @@ from gymnasium.vector import AutoresetMode
 import misbehaving
 from headway import envs
 from headway.envs import ClassicVectorEnv, RobotVectorEnv, SequentialVectorEnv
-from headway.errors import ConfigError, UnknownNameError
+from headway.errors import BadEnvironmentError, ConfigError, UnknownNameError
 from headway.sim_params import SimParamSets
-from headway.task import EnvSpec, env_spec
+from headway.task import EnvSpec, env_spec, register
 from headway.worlds.classic import PendulumTask
 
 NUM = 5
@@ -100,6 +100,9 @@ def test_bad_arguments_are_refused():
     for arguments in ({"num_envs": 0}, {"num_envs": 1, "episode_length": 0}):
         with pytest.raises(ConfigError):
             envs.make_vec("pendulum", **arguments)
+    for wrong in ({"sizes": {1, 2}}, {"gain": np.nan}):
+        with pytest.raises(ConfigError, match="allowed: what JSON holds"):
+            dataclasses.replace(DRIFT, options=wrong)
     with pytest.raises(UnknownNameError, match="Did you mean 'scale_inertia'"):
         envs.make_vec("hopper", 1, options={"scale_inertias": True})
     foreign = SequentialVectorEnv([lambda: gymnasium.make("Pendulum-v1")] * 2)
@@ -166,6 +169,56 @@ def test_environments_of_ones_own():
     first = vector.reset(seed=4)[1]["sim_params"]["drift"]
     np.testing.assert_array_equal(vector.reset(seed=4)[1]["sim_params"]["drift"], first)
     assert isinstance(envs.make("test_vector:DRIFT").unwrapped, misbehaving.Drift)
+
+
+gymnasium.register("own/VectorDrift-v3", "misbehaving:Drift")
+IDS = ["own/VectorDrift", "test_vector:own/VectorDrift-v0", misbehaving.Drift]
+
+
+@pytest.mark.parametrize("timeout_s", [None, 60.0])
+@pytest.mark.parametrize("env_id", IDS)
+def test_an_environment_is_named_as_gymnasium_names_it_or_by_what_makes_it(env_id, timeout_s):
+    options = {"how": "give_up", "at": 2, "drift": None}  # of any type that JSON has
+    register(dataclasses.replace(DRIFT, name="named", env_id=env_id))
+    vector = envs.make_vec("named", 1, options=options, step_timeout_s=timeout_s)
+    vector.reset(seed=0)
+    actions = np.ones((1, 1), np.float32)
+    assert "broken" not in vector.step(actions)[-1]
+    assert vector.step(actions)[-1]["broken"] == {0: "the robot fell apart"}
+    vector.close()
+
+
+class Alone(misbehaving.Drift):
+    busy = False
+
+    def __init__(self):
+        if Alone.busy:
+            raise OSError("busy")
+        Alone.busy = True
+
+    def close(self):
+        Alone.busy = False
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        (vars(Alone), r"2 of 2 .*\(OSError: busy\); .* set collection.num_episodes to 1"),
+        ({"reset": lambda self: self.reset()}, "reset takes no seed or options .* shimmy"),
+        ({"reset": lambda self, **given: np.zeros(3)}, "reset returns no .* shimmy"),
+        ({"step": lambda self, action: (action, 0.0, False, {})}, "step returns 4 .* shimmy"),
+        ({"observation_space": gymnasium.spaces.Tuple([])}, "FlattenObservation"),
+    ],
+)
+def test_environments_that_cannot_serve_are_named_in_one_line_and_closed(changes, says):
+    kind = type("Unfit", (misbehaving.Drift,), dict(changes))
+    register(dataclasses.replace(DRIFT, name="unfit", env_id=kind))
+    with pytest.raises(BadEnvironmentError, match=says) as caught:  # noqa: PT012
+        vector = envs.make_vec("unfit", 2)
+        vector.reset()
+        vector.step(np.zeros((2, 1), np.float32))
+    assert "\n" not in str(caught.value)
+    assert not Alone.busy
 
 
 def test_own_physics_under_another_name_steps_as_fast():

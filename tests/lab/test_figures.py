@@ -13,6 +13,8 @@ from PIL import Image
 from headway.lab import figures
 from headway.lab.figures import save_run_figures
 from headway.lab.paper import Arm, experiment, sweep_experiment
+from headway.lab.report import write_report
+from headway.sim_params import SimParamSets, Uniform
 from headway.training.methods import METHODS
 
 TABLES = ["metrics.jsonl", "evaluation.csv", "assignments.csv", "prediction_error.csv"]
@@ -29,6 +31,14 @@ def test_every_figure_is_drawn_and_settings_of_the_user_stay(run_dir):
         assert pixels.shape[0] > 400
         assert 0.005 < (pixels < 200).mean() < 0.6
     assert dict(matplotlib.rcParams) == before
+
+
+def test_physics_of_any_name_and_range_are_drawn(tmp_path):
+    values = {"pole, x [$m$]=1": Uniform(0.5, 1.0), "mass\n<b>_2": (1.0, 2.0)}
+    sets = SimParamSets(values, {"low": values, "high": values})
+    run = fakes.write(tmp_path / "run", iterations=1, sim_params=sets)
+    assert [path.name for path in save_run_figures(run)] == ALL
+    assert write_report([run], tmp_path / "report.html").exists()
 
 
 @pytest.mark.parametrize(("missing", "figure"), list(zip(TABLES, ALL, strict=True)))

@@ -8,17 +8,20 @@ import numpy as np
 import pytest
 from PIL import Image, ImageColor
 
+import misbehaving
 from headway import cli
 from headway.config import PlannerConfig
-from headway.envs import make
-from headway.errors import BadEnvironmentError, ConfigError
+from headway.envs import ClassicVectorEnv
+from headway.errors import BadEnvironmentError, ConfigError, HeadwayError
 from headway.lab import record as lab
 from headway.lab.figures import HEADS, INK
 from headway.lab.record import MARGIN, WIDTH, Recording, film
 from headway.planning.agent import Agent
-from headway.task import task_of
+from headway.sim_params import SimParamSets, Uniform
+from headway.task import EnvSpec, register, task_of
 from headway.training.methods import make_config
 from headway.training.run import RunDir
+from headway.worlds.classic import PendulumTask
 
 SCENE = (240, 320)
 
@@ -139,10 +142,47 @@ def test_what_cannot_be_filmed_is_refused_and_nothing_is_written(asked, reason, 
 
 
 def test_an_environment_that_draws_nothing_is_named(run_dir, tmp_path, monkeypatch):
-    made = make("pendulum").unwrapped
-    monkeypatch.setattr(type(made), "render", lambda self: None)
+    monkeypatch.setattr(ClassicVectorEnv, "frame", lambda self, i: None)
     with pytest.raises(BadEnvironmentError, match="gave NoneType, allowed: an image"):
         lab.record(run_dir, tmp_path / "film.gif", num_steps=2)
+
+
+@pytest.fixture
+def own(run_dir, tmp_path):
+    """Begins a run on an environment of one's own."""
+
+    def begin(make_env, **changes):
+        sets = SimParamSets({"drift": Uniform(0.5, 1)}, {"far": {"drift": (3.0,)}})
+        task = lambda **options: PendulumTask()  # noqa: E731 (of the same sizes)
+        register(EnvSpec("own", make_env, task, sets, 20, {"drift": 1.0}, {"how": ""}))
+        run = RunDir(tmp_path / "own")
+        run.begin(make_config("own", preset="smoke", settings=changes))
+        return run.path
+
+    return begin
+
+
+@pytest.mark.parametrize("processes", [False, True])
+def test_a_film_shows_the_environment_with_its_wrappers(own, tmp_path, processes):
+    path = own(misbehaving.wrapped, **{"collection.env_processes": processes})
+    asked = {"sim_params": {"drift": 0.5}, "schedule": {3: {"drift": 4.0}}}
+    found = lab.record(path, tmp_path / "film.gif", **asked)
+    assert (found.steps, found.episode_return, found.sim_params) == (12, 84.0, {"drift": 4.0})
+
+
+@pytest.mark.parametrize(
+    ("make_env", "how", "drift", "says"),
+    [
+        (misbehaving.Drift, "", "drift", "TypeError at creation with render_mode, to be filmed"),
+        (misbehaving.wrapped, "give_up", "drift", "at step 3: .*the robot fell apart"),
+        (misbehaving.wrapped, "", "drif", "Did you mean 'drift'"),
+    ],
+)
+def test_own_environments_that_cannot_be_filmed(own, tmp_path, make_env, how, drift, says):
+    path = own(make_env, env_options={"how": how})
+    with pytest.raises(HeadwayError, match=says):
+        lab.record(path, tmp_path / "film.gif", sim_params={drift: 1.0})
+    assert not (tmp_path / "film.gif").exists()
 
 
 def test_the_command_line_reads_physics_and_schedule(run_dir, tmp_path, monkeypatch, capsys):
@@ -153,10 +193,18 @@ def test_the_command_line_reads_physics_and_schedule(run_dir, tmp_path, monkeypa
         return Recording(output, "pendulum", {"length": 1.0}, 5, -7.25)
 
     monkeypatch.setattr(lab, "record", record)
-    words = ["--sim-params", "length=1.75", "--schedule", "60:length=0.5", "60:mass=2", "90:mass=1"]
+    words = [
+        "--sim-params",
+        "length=1.75",
+        "m [kg]=2",
+        "--schedule",
+        "60:length=0.5",
+        "60:mass=2",
+        "90:mass=1",
+    ]
     code = cli.main(["record", str(run_dir), *words, "--planner.horizon", "7", "--quiet"])
     assert code == 0
-    assert calls[0]["sim_params"] == {"length": 1.75}
+    assert calls[0]["sim_params"] == {"length": 1.75, "m [kg]": 2.0}
     assert calls[0]["schedule"] == {60: {"length": 0.5, "mass": 2.0}, 90: {"mass": 1.0}}
     assert calls[0]["settings"] == {"planner.horizon": 7}
     assert capsys.readouterr().out == "episode.gif: 5 steps, return -7.2\n"

@@ -76,9 +76,19 @@ def test_a_test_may_change_only_settings_that_training_did_not_fix():
             config_to_evaluate(config, {name: 1}, sections)
 
 
-def test_unknown_environment_option_is_refused():
-    with pytest.raises(ConfigError, match="terminate_off_track"):
-        make_config("cartpole-swingup", settings={"env_options": {"terminate_off_trak": True}})
+@pytest.mark.parametrize(
+    ("option", "says"),
+    [
+        ({"terminate_off_trak": True}, "Did you mean 'terminate_off_track'"),
+        ({"terminate_off_track": "yes"}, "allowed: True or False"),
+        ({"terminate_off_track": {1}}, "JSON"),
+        ({"terminate_off_track": [float("nan")]}, "allowed: a finite number"),
+    ],
+)
+def test_environment_options_that_do_not_exist_or_fit_are_refused(option, says):
+    with pytest.raises(ConfigError, match=says) as caught:
+        make_config("cartpole-swingup", settings={"env_options": option})
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("env", env_names())
@@ -105,4 +115,9 @@ def test_score_is_zero_for_random_and_one_for_the_ceiling():
 def test_sim_params_survive_their_cell():
     sim_params = {"mass_scale": 0.375, "damping_scale": 1.0}
     assert format_sim_params(sim_params) == "damping_scale=1 mass_scale=0.375"
+    odd = ("mass [kg]", "a=b", 'say "x"=2', '"', "\\", "", "µ\n=1 b")
+    sim_params |= dict.fromkeys(odd, -1e-9)
     assert parse_sim_params(format_sim_params(sim_params)) == sim_params
+    for wrong in ("length", "length=", "=1", "length=x", "length=1=2", 'a "b=1', "[kg] mass=1"):
+        with pytest.raises(ValueError, match=r"form|float"):
+            parse_sim_params(wrong)

@@ -185,9 +185,12 @@ def test_a_second_process_is_refused_until_the_first_is_killed(root):
         pass
 
 
-def test_where_nothing_can_be_locked_a_run_is_refused_in_one_line(root, monkeypatch):
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOLCK, "No locks here"), NotImplementedError("No locks here")]
+)
+def test_where_nothing_can_be_locked_a_run_is_refused_in_one_line(error, root, monkeypatch):
     def no_lock(*_):
-        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+        raise error
 
     monkeypatch.setattr(fcntl, "flock", no_lock)
     with pytest.raises(RunError, match="cannot be written: No locks"), RunDir(root).locked():
@@ -202,9 +205,13 @@ def test_folders_that_cannot_be_synced_are_written_to(tmp_path, monkeypatch):
             raise OSError(errno.EINVAL, "Invalid argument")
         plain(handle)
 
-    monkeypatch.setattr(os, "fsync", files_only)
-    write_bytes(tmp_path / "new/file", b"content")
-    assert (tmp_path / "new/file").read_bytes() == b"content"
+    def no_folders(path, flags):
+        raise OSError(errno.EISDIR, "Is a directory")
+
+    for name, instead in (("fsync", files_only), ("open", no_folders)):
+        monkeypatch.setattr(os, name, instead)
+        write_bytes(tmp_path / "new" / name, b"content")
+        assert (tmp_path / "new" / name).read_bytes() == b"content"
 
 
 @pytest.mark.parametrize("name", ["fifo", "folder", ".", "link"])

@@ -6,7 +6,8 @@
 import abc
 import copy
 import functools
-from collections.abc import Mapping, Sequence
+import importlib
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -14,6 +15,7 @@ import gymnasium
 import mujoco
 import mujoco.rollout
 import numpy as np
+from gymnasium.envs.registration import find_highest_version, get_env_id, parse_env_id
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 from jaxtyping import Float
 
@@ -22,12 +24,12 @@ from headway.envs.vector import HeadwayVectorEnv, ProcessVectorEnv, SequentialVe
 from headway.errors import BadEnvironmentError, BrokenEpisodeError, ConfigError
 from headway.sim_params import SimParamSets
 from headway.spaces import Spaces
-from headway.task import env_spec
+from headway.task import EnvSpec, env_spec
 from headway.worlds import classic, locomotion
 from headway.worlds.base import World
 from headway.worlds.locomotion import Robot, RobotState
 
-_WORLDS: Mapping[str, type[World]] = {
+_WORLDS: Mapping[Any, type[World]] = {
     world.spec.env_id: world for world in (*classic.WORLDS, *locomotion.WORLDS)
 }
 
@@ -42,6 +44,7 @@ class WorldVectorEnv(HeadwayVectorEnv):
         spaces = Box(-bounds, bounds, dtype=dtype), Box(low, high, dtype=np.float32)
         super().__init__(num_envs, spaces, episode_length)
         self.world: Any = world
+        self.metadata = self.metadata | {"render_fps": round(1 / world.time_step)}
         for i in range(num_envs):
             self._note(i, world.spec.default_sim_params)
 
@@ -96,6 +99,10 @@ class WorldVectorEnv(HeadwayVectorEnv):
     @abc.abstractmethod
     def frame(self, i: int) -> np.ndarray:
         """Draw environment `i`."""
+
+    def render(self) -> tuple[np.ndarray, ...]:
+        """Draw all environments."""
+        return tuple(map(self.frame, range(self.num_envs)))
 
     @abc.abstractmethod
     def _set_state(self, i: int, state: np.ndarray) -> None:
@@ -299,7 +306,7 @@ class HeadwayEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             raise ConfigError(f"render_mode is {render_mode!r}, allowed: None or 'rgb_array'.")
         self.vector: Any = _vector(_WORLDS[env_spec(name).env_id](sim_params, **options), 1)
         self.render_mode = render_mode
-        self.metadata = self.metadata | {"render_fps": round(1 / self.vector.world.time_step)}
+        self.metadata = self.metadata | {"render_fps": self.vector.metadata["render_fps"]}
         self.action_space = self.vector.single_action_space
         self.observation_space = self.vector.single_observation_space
 
@@ -390,8 +397,22 @@ def make(name: str, **kwargs: Any) -> gymnasium.Env:
 
     Raises:
         UnknownNameError: No such environment or option.
+        gymnasium.error.Error: Gymnasium does not know the environment's id.
     """
-    return gymnasium.make(env_spec(name).env_id, **kwargs)
+    return _maker(env_spec(name))(**kwargs)
+
+
+def _maker(spec: EnvSpec) -> Callable[..., gymnasium.Env]:
+    """What makes the environment from keywords; also in a process that has registered nothing."""
+    if not isinstance(spec.env_id, str):
+        return spec.env_id
+    module, _, env_id = spec.env_id.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    namespace, name, version = parse_env_id(env_id)
+    if version is None:
+        version = find_highest_version(namespace, name)
+    return functools.partial(gymnasium.make, gymnasium.spec(get_env_id(namespace, name, version)))
 
 
 def make_vec(
@@ -399,9 +420,10 @@ def make_vec(
     num_envs: int,
     *,
     sim_params: SimParamSets | None = None,
-    options: Mapping[str, bool] | None = None,
+    options: Mapping[str, Any] | None = None,
     episode_length: int | None = None,
     step_timeout_s: float | None = None,
+    render_mode: str | None = None,
 ) -> HeadwayVectorEnv:
     """Make many environments that step together, each with physics of its own.
 
@@ -411,14 +433,16 @@ def make_vec(
         name: For example `"hopper"`, `"headway/Hopper-v0"` or `"my_package:cart"`.
         num_envs: How many.
         sim_params: Replaces the spec's training and unseen physics.
-        options: Boolean options of the environment.
+        options: Options of the environment.
         episode_length: Steps after which an episode is cut; None takes the spec's.
         step_timeout_s: Steps every environment in a process of its own, and gives it up when a
             step takes longer (`ProcessVectorEnv`); None steps all in this process.
+        render_mode: `"rgb_array"` to draw with `render`; given to environments of your own.
 
     Raises:
         UnknownNameError: No such environment or option.
         ConfigError: A number or a parameter is not allowed.
+        gymnasium.error.Error: Gymnasium does not know the environment's id.
         BadEnvironmentError: An environment could not be made in its process.
     """
     spec = env_spec(name)
@@ -432,9 +456,11 @@ def make_vec(
         draws = sets
     else:  # these draw physics themselves
         given["sim_params"] = sets
-    # A longer episode than Gymnasium's own limit must be possible, so ours replaces it.
-    registered = gymnasium.spec(spec.env_id)  # another process may not have registered it
-    one = functools.partial(gymnasium.make, registered, max_episode_steps=length, **given)
+    if render_mode is not None:
+        given["render_mode"] = render_mode
+    if isinstance(spec.env_id, str):
+        given["max_episode_steps"] = -1  # ours replaces Gymnasium's limit
+    one = functools.partial(_maker(spec), **given)
     shared: dict[str, Any] = {"sim_params": draws, "episode_length": length}
     if step_timeout_s is None:
         return SequentialVectorEnv([one] * num_envs, **shared)

@@ -7,11 +7,13 @@ import abc
 import contextlib
 import multiprocessing
 import os
+import re
 import signal
 import time
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 import gymnasium
@@ -19,7 +21,7 @@ import numpy as np
 from gymnasium.error import NoAsyncCallError
 from gymnasium.utils import seeding
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
+from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 
 from headway.errors import (
     BadEnvironmentError,
@@ -248,7 +250,8 @@ class SequentialVectorEnv(HeadwayVectorEnv):
 
     Raises:
         ConfigError: There are none.
-        BadEnvironmentError: Their spaces differ.
+        BadEnvironmentError: Their spaces differ or are no arrays, or one cannot be made after
+            others were. None stays open.
     """
 
     def __init__(
@@ -260,18 +263,32 @@ class SequentialVectorEnv(HeadwayVectorEnv):
     ):
         if not env_fns:
             raise ConfigError("env_fns is empty, allowed: at least one.")
-        self.envs: list[Any] = self._make_all(env_fns)
-        spaces = [self._spaces(env) for env in self.envs]
-        super().__init__(len(spaces), spaces[0], episode_length)
-        for own in spaces:
-            self._check_spaces(own)
+        self.envs: list[Any] = []
+        try:
+            for env in self._make_all(env_fns):
+                self.envs.append(env)
+            spaces = [self._spaces(env) for env in self.envs]
+            super().__init__(len(spaces), spaces[0], episode_length)
+            for own in spaces:
+                self._check_spaces(own)
+        except Exception as error:
+            self.close_extras()
+            if 0 < len(self.envs) < len(env_fns):
+                reason = " ".join(str(error).split())[:300]
+                raise BadEnvironmentError(
+                    f"environment {len(self.envs) + 1} of {len(env_fns)} could not be made"
+                    f" ({type(error).__name__}: {reason}); if only one can exist, set"
+                    " collection.num_episodes to 1."
+                ) from error
+            raise
+        self.metadata = {"render_fps": 20} | self.envs[0].metadata | self.metadata
         self._sets, self._changes = sim_params, {}
         self._obs: list[Any] = [np.zeros(spaces[0][0].shape or ()) for _ in spaces]
         self.told: list[SimParams] = [{} for _ in spaces]
         """What each environment said at its reset that its simulator parameters are."""
 
-    def _make_all(self, env_fns: Makers) -> list[Any]:
-        return [make() for make in env_fns]
+    def _make_all(self, env_fns: Makers) -> Iterable[Any]:
+        return (gymnasium.Wrapper(make()) for make in env_fns)  # which refuses what is no Env
 
     def _spaces(self, env: Any) -> Spaces:
         return env.observation_space, env.action_space
@@ -285,6 +302,12 @@ class SequentialVectorEnv(HeadwayVectorEnv):
             except BrokenEpisodeError as error:
                 self._broken[i] = str(error)
         return answers
+
+    def _check_sim_params(self, values: dict[str, Any]) -> SimParams:
+        for name in values:
+            if self._sets is not None and name not in self._sets.names:
+                raise ConfigError(str(unknown_name("sim_param", name, self._sets.names)))
+        return values
 
     def _begin(self, seeds: Mapping[int, int | None], requested: Sequence[SimParams]) -> None:
         asked = {i: requested[i] for i in seeds}
@@ -316,6 +339,13 @@ class SequentialVectorEnv(HeadwayVectorEnv):
 
     def _check_spaces(self, spaces: Spaces) -> None:
         allowed = self.single_observation_space, self.single_action_space
+        for space in spaces:
+            if space.shape is None:
+                raise BadEnvironmentError(
+                    f"an environment has the space {shown(space)}, allowed: one array; where it is"
+                    " made, wrap it with gymnasium.wrappers.FlattenObservation (or, for actions,"
+                    " TransformAction)."
+                )
         if spaces != allowed:
             raise BadEnvironmentError(
                 f"an environment has the observation and action space {spaces}, allowed:"
@@ -335,6 +365,10 @@ class SequentialVectorEnv(HeadwayVectorEnv):
         """Stack what the environments returned last."""
         return np.stack(self._obs)
 
+    def render(self) -> tuple[Any, ...]:
+        """Draw all that do not break meanwhile, as they were told when they were made."""
+        return tuple(self._call("render", dict.fromkeys(range(self.num_envs), ())).values())
+
     def close_extras(self, **kwargs: Any) -> None:
         """Close the environments."""
         for env in self.envs:
@@ -345,10 +379,20 @@ def _answer(env: gymnasium.Env, method: str, *given: Any) -> Any:
     """Call a method of an environment and return what matters of the answer.
 
     `reset` gives observation, simulator parameters and spaces; `step`, maybe after a change of
-    simulator parameters, all but the infos.
+    simulator parameters, all but the infos; `render` a picture.
     """
+    if method == "render":
+        return env.render()
     if method == "reset":
-        obs, info = env.reset(seed=given[0], options=given[1])
+        try:
+            found = env.reset(seed=given[0], options=given[1])
+        except TypeError as error:
+            if re.search(r"keyword argument '(seed|options)'", str(error)):
+                raise _old(f"reset takes no seed or options ({error})") from error
+            raise
+        if not (isinstance(found, tuple) and len(found) == 2):
+            raise _old("reset returns no (obs, info)")
+        obs, info = found
         return obs, info.get("sim_params", {}), (env.observation_space, env.action_space)
     action, changed = given
     if changed:
@@ -358,7 +402,17 @@ def _answer(env: gymnasium.Env, method: str, *given: Any) -> Any:
                 " one, or leave the schedule out."
             )
         env.get_wrapper_attr("set_sim_params")(changed)
-    return env.step(action)[:4]
+    found = env.step(action)
+    if len(found) != 5:
+        raise _old(f"step returns {len(found)} values, not 5 with terminated and truncated")
+    return found[:4]
+
+
+def _old(what: str) -> BadEnvironmentError:
+    return BadEnvironmentError(
+        f"an environment's {what}, as in old Gym, allowed: environments of Gymnasium; rewrite it,"
+        " or wrap it with GymV21CompatibilityV0 of the package shimmy."
+    )
 
 
 class ProcessVectorEnv(SequentialVectorEnv):
@@ -379,21 +433,32 @@ class ProcessVectorEnv(SequentialVectorEnv):
         **kwargs: See `SequentialVectorEnv`.
 
     Raises:
-        ConfigError: A number is not allowed.
+        ConfigError: A number is not allowed, or what makes an environment cannot be sent to a
+            process.
         BadEnvironmentError: An environment could not be made, or their spaces differ.
     """
 
     def __init__(self, env_fns: Makers, *, step_timeout_s: float, **kwargs: Any):
         if not step_timeout_s > 0:
             raise ConfigError(f"step_timeout_s is {step_timeout_s}, allowed: more than 0.")
+        try:
+            ForkingPickler.dumps([CloudpickleWrapper(make) for make in env_fns])
+        except Exception as error:  # whatever its parts raise
+            raise ConfigError(
+                f"an environment cannot be sent to a process of its own ({error}), allowed: what"
+                " pickle takes; make inside of the environment what it needs, or switch"
+                " collection.env_processes off."
+            ) from error
         self._env_fns, self._timeout_s = list(env_fns), step_timeout_s
         self._living: dict[int, Any] = {}
         self._end = weakref.finalize(self, _kill, self._living)
         super().__init__(env_fns, **kwargs)
 
-    def _make_all(self, env_fns: Makers) -> list[Any]:
+    def _make_all(self, env_fns: Makers) -> Iterable[Any]:
         with ThreadPoolExecutor(len(env_fns)) as pool:  # each waits for its process to begin
-            return list(pool.map(self._make_one, range(len(env_fns))))
+            begun = [pool.submit(self._make_one, i) for i in range(len(env_fns))]
+        begun.sort(key=lambda one: one.exception() is not None)  # first those that could be made
+        return (one.result() for one in begun)
 
     def _spaces(self, env: Any) -> Spaces:
         return env.single_observation_space, env.single_action_space

@@ -3,6 +3,7 @@
 import dataclasses
 import io
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,14 @@ import numpy as np
 from jaxtyping import Int, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from headway.envs import make
+from headway.config import override
 from headway.envs.vector import Schedule
 from headway.errors import BadEnvironmentError, ConfigError
 from headway.lab.figures import FAINT, HEADS, INK
 from headway.lab.tables import full_label
 from headway.planning.controller import Controller
-from headway.task import env_options, episode_length
+from headway.task import episode_length
+from headway.training.collect import Environments, raising
 from headway.training.files import write_bytes
 from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
@@ -70,7 +72,7 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
     settings: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Recording:
-    """Let a trained controller act in one environment and film it.
+    """Let a trained controller act in one environment, as it was trained in, and film it.
 
     Below the picture, a strip per ensemble member shows the head that it planned with at every
     step. Drawing the robots needs OSMesa or EGL.
@@ -90,7 +92,7 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
     Raises:
         RunError: There is no trained run, it does not keep the iteration, or it is damaged.
         ConfigError: The ending, a simulator parameter, a step or a setting is not allowed.
-        BadEnvironmentError: The environment cannot be drawn.
+        BadEnvironmentError: The environment cannot be drawn, or broke.
     """
     path = Path(output)
     if path.suffix.lower() not in FORMATS:
@@ -101,29 +103,33 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
     config = config_to_evaluate(run.config(), settings or {})
     controller = Controller(load_agent(run, config, iteration=iteration), seed=seed)
     length = num_steps or episode_length(config)
-    own = {"sim_params": config.sim_params} if config.sim_params else {}
-    made = make(config.env, render_mode="rgb_array", **env_options(config), **own)
-    env = made.unwrapped  # episodes are cut here, not by Gymnasium
+    config = override(config, {"collection.episode_length": length})
     options = {"sim_params": dict(sim_params or {}), "schedule": dict(schedule or {})}
-    obs, info = env.reset(seed=seed, options=options)
-    controller.reset(info.get("sim_params"))
     moments: list[Moment] = []
-    with progress or Progress() as shown:
+    with closing(Environments.make(config, film=True)) as made, progress or Progress() as shown:
+        env: Any = made.vector
+        with raising(config.env, "reset"):
+            obs, info = env.reset(seed=seed, options=options)
+        controller.reset({name: float(value) for name, (value,) in info["sim_params"].items()})
         shown.phase("act", length)
-        for _ in range(length):
-            obs, reward, terminated, _, info = env.step(controller.act(obs))
-            image = env.render()
-            if not isinstance(image, np.ndarray) or image.ndim != 3:
-                raise BadEnvironmentError(
-                    f"render() of {env} gave {type(image).__name__}, allowed: an image of shape"
-                    " [height, width, 3], as with render_mode='rgb_array'."
-                )
-            physics = dict(info.get("sim_params", options["sim_params"]))
-            moments.append(Moment(image, physics, float(reward), controller.heads))
+        for step in range(1, length + 1):
+            action = controller.act(obs[0])
+            with raising(config.env, f"step {step}"):
+                obs, reward, terminated, truncated, info = env.step(action[None])
+                if "broken" in info:
+                    raise BadEnvironmentError(f"it broke, {info['broken'][0]}")
+                (image,) = env.render()
+                if not isinstance(image, np.ndarray) or image.ndim != 3:
+                    raise BadEnvironmentError(
+                        f"render() gave {type(image).__name__}, allowed: an image of shape"
+                        " [height, width, 3], as with render_mode='rgb_array'."
+                    )
+            physics = {name: float(value) for name, (value,) in info["sim_params"].items()}
+            moments.append(Moment(image, physics, float(reward[0]), controller.heads))
             shown.advance()
-            if terminated:
+            if terminated[0] or truncated[0]:
                 break
-    content = film(moments, env.metadata.get("render_fps", 20), path.suffix.lower())
+    content = film(moments, env.metadata["render_fps"], path.suffix.lower())
     write_bytes(path, content)
     total = float(sum(moment.reward for moment in moments))
     return Recording(path, config.env, dict(moments[-1].sim_params), len(moments), total)

@@ -54,25 +54,27 @@ class Environments:
     episode_length: int
 
     @classmethod
-    def make(cls, config: Config) -> "Environments":
-        """Make as many as a configuration collects episodes.
+    def make(cls, config: Config, *, film: bool = False) -> "Environments":
+        """Make as many as a configuration collects episodes, or one that can be filmed.
 
         Raises:
-            BadEnvironmentError: The environment's spaces do not fit its Task or its run, or no
-                plan is made in such spaces.
+            BadEnvironmentError: It cannot be made, its spaces do not fit its Task or its run, or
+                no plan is made in such spaces.
         """
         from headway import envs  # a controller is loaded without a simulator
 
         collection, options = config.collection, env_options(config)
         sim_params = sim_param_sets(config)
-        vector = envs.make_vec(
-            config.env,
-            collection.num_episodes,
-            sim_params=sim_params,
-            options=options,
-            episode_length=episode_length(config),
-            step_timeout_s=collection.step_timeout_s if collection.env_processes else None,
-        )
+        with raising(config.env, "creation" + film * " with render_mode, to be filmed"):
+            vector = envs.make_vec(
+                config.env,
+                1 if film else collection.num_episodes,
+                sim_params=sim_params,
+                options=options,
+                episode_length=episode_length(config),
+                step_timeout_s=collection.step_timeout_s if collection.env_processes else None,
+                render_mode="rgb_array" if film else None,
+            )
         try:
             read = envs.read_spaces(vector.single_observation_space, vector.single_action_space)
             task = _task_in(config, read)
@@ -246,7 +248,7 @@ def run_episodes(
     seeds: Any = [episode.seed for episode in filled]
     valid = _ValidityFilter(environments.name, [episode.sim_params for episode in filled])
     running = valid.running
-    with valid.raising("reset"):
+    with raising(environments.name, "reset"):
         obs, info = vector.reset(seed=seeds, options=options)
     valid.heed(info, 0)
     obs = valid.finite(obs, "obs", 0, np.zeros((len(filled), environments.task.obs_size)))
@@ -267,7 +269,7 @@ def run_episodes(
             timed * len(filled),
             timed * seconds,
         )
-        with valid.raising(f"step {step}"):
+        with raising(environments.name, f"step {step}"):
             obs, reward, ends, cut, info = vector.step(env_action(environments.task, choice.action))
         valid.heed(info, step)
         obs = valid.finite(obs, "obs", step, observations[-1])
@@ -294,6 +296,27 @@ def run_episodes(
     }
     invalid = {row: valid.reasons[row] for row in sorted(valid.reasons) if row < wanted}
     return Rollout(trajectories, use, invalid, time.perf_counter() - begun)
+
+
+@contextlib.contextmanager
+def raising(name: str, when: str) -> Iterator[None]:
+    """Turn whatever the environment `name` raises into one line that says when.
+
+    Raises:
+        BadEnvironmentError: It raised.
+    """
+    try:
+        yield
+    except BadEnvironmentError as error:
+        raise BadEnvironmentError(f"{name} at {when}: {error}") from error
+    except HeadwayError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())[:300]
+        raise BadEnvironmentError(
+            f"{name} raised {type(error).__name__} at {when}: {reason}; correct the environment,"
+            " then the same command goes on."
+        ) from error
 
 
 def fill(episodes: Sequence[Episode], num_envs: int) -> list[Episode]:
@@ -325,26 +348,6 @@ class _ValidityFilter:
         for row, reason in info.get("broken", {}).items():
             where = f"{self._name} broke at step {step} under {self._physics[row]}"
             self._note(row, f"{where}: {' '.join(reason.split())[:300]}")
-
-    @contextlib.contextmanager
-    def raising(self, when: str) -> Iterator[None]:
-        """Turn whatever an environment raises into one line that says where.
-
-        Raises:
-            BadEnvironmentError: It raised.
-        """
-        try:
-            yield
-        except BadEnvironmentError as error:
-            raise BadEnvironmentError(f"{self._name} at {when}: {error}") from error
-        except HeadwayError:
-            raise
-        except Exception as error:
-            reason = " ".join(str(error).split())[:300]
-            raise BadEnvironmentError(
-                f"{self._name} raised {type(error).__name__} at {when}: {reason};"
-                " correct the environment, then the same command goes on."
-            ) from error
 
     def finite(self, values: Any, what: str, step: int, instead: np.ndarray) -> np.ndarray:
         """Replace what is not finite by `instead`, and note those episodes.

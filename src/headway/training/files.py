@@ -136,12 +136,12 @@ def make_dir(path: Path) -> None:
 def _sync_dir(path: Path) -> None:
     """Make renames and deletions survive a loss of power, where a file system can promise it."""
     if os.name == "posix":
-        handle = os.open(path, os.O_RDONLY)
-        try:
-            with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):
+            handle = os.open(path, os.O_RDONLY)
+            try:
                 os.fsync(handle)
-        finally:
-            os.close(handle)
+            finally:
+                os.close(handle)
 
 
 @contextlib.contextmanager

@@ -19,11 +19,13 @@ there, so whatever an interrupted iteration left behind is written again.
 import contextlib
 import csv
 import dataclasses
+import errno
 import hashlib
 import importlib.metadata
 import io
 import json
 import platform
+import re
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -72,6 +74,8 @@ _TYPES = {
     **dict.fromkeys(("return", "share", "error"), float),
 }
 _ARRAYS = ("obs", "action", "reward")  # of a trajectory
+_PLAIN = re.compile(r'[^\s"=][^\s=]*')  # names that stand in a table as they are
+_PAIR = re.compile(rf'("(?:\\.|[^"\\])*"|{_PLAIN.pattern})=(\S+)(?:\s+|$)')
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,8 +108,11 @@ class EpisodeRow:
 
 
 def format_sim_params(sim_params: Mapping[str, float]) -> str:
-    """Simulator parameters as one cell of a table, for example `length=0.5 mass=1`."""
-    return " ".join(f"{name}={value:.12g}" for name, value in sorted(sim_params.items()))
+    """Simulator parameters as one cell of a table, for example `length=0.5 "mass [kg]"=1`."""
+    return " ".join(
+        f"{name if _PLAIN.fullmatch(name) else json.dumps(name)}={value:.12g}"
+        for name, value in sorted(sim_params.items())
+    )
 
 
 def parse_sim_params(text: str) -> dict[str, float]:
@@ -114,7 +121,10 @@ def parse_sim_params(text: str) -> dict[str, float]:
     Raises:
         ValueError: The text is not of that form.
     """
-    return {name: float(value) for name, value in (pair.split("=") for pair in text.split())}
+    if _PAIR.sub("", text.strip()):
+        raise ValueError(f"{text!r} is not of the form name=value")
+    found = _PAIR.findall(text)
+    return {json.loads(n) if n[0] == '"' else n: float(value) for n, value in found}
 
 
 class RunDir:
@@ -162,6 +172,8 @@ class RunDir:
                     f"{self.path} is being trained by another process, allowed: one at a time;"
                     " wait for it or choose another --run-dir."
                 ) from None
+            except NotImplementedError as error:  # in place of OSError in some versions
+                raise OSError(errno.ENOSYS, f"{error}") from None
         try:
             yield
         finally:

@@ -41,7 +41,7 @@ from headway.models.multi_headed import MultiHeadModel, MultiHeadNet
 from headway.models.rebal import ReBAL, RecurrentNet, recurrent_epoch
 from headway.models.statistics import Statistics
 from headway.planning.agent import Agent
-from headway.task import episode_length, task_of
+from headway.task import episode_length, sim_param_sets, task_of
 from headway.training.collect import Environments
 from headway.training.diagnostics import prediction_error
 from headway.training.methods import told_sim_params
@@ -250,10 +250,11 @@ class MultiHeadedTrainer(Fitted):
         assigned = eqx.filter_jit(assign_segments)(net, setup, episodes, state.statistics)
         best = np.asarray(assigned.forward)
         counts = defaultdict(lambda: np.zeros((net.num_members, net.num_heads)))
+        sets = sim_param_sets(self.config)
         for row, trajectory in enumerate(trajectories):
             used = -(-len(trajectory) // setup.segment_length)
             of_heads = best[:, row, :used, None] == np.arange(net.num_heads)
-            counts[format_sim_params(trajectory.sim_params)] += of_heads.sum(1)
+            counts[format_sim_params(sets.nearest(trajectory.sim_params))] += of_heads.sum(1)
         return [
             {"member": member, "head": head, "sim_params": physics, "share": float(share)}
             for physics, count in sorted(counts.items())
