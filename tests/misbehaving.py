@@ -120,6 +120,17 @@ class Drift(gymnasium.Env):
         self.action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
 
 
+class Alone(Drift):
+    """Only one can exist: it holds the file `mark`."""
+
+    def __init__(self, mark):
+        super().__init__(mark=mark)
+        Path(mark).touch(exist_ok=False)
+
+    def close(self):
+        Path(self.mark).unlink()
+
+
 class Drawn(Drift):
     """It can be drawn."""
 

@@ -526,7 +526,7 @@ class List(Command):
             table = new_table("Environments", *texts, numbers=("obs", "action", "steps"))
             table.columns[0].no_wrap = True
             for spec in map(env_spec, env_names()):
-                task, sets = spec.make_task(**spec.options), spec.sim_params
+                task, sets = spec.task(spec.options), spec.sim_params
                 groups = {name: list(map(dict, sets.group(name))) for name in sets.group_names}
                 entry = {
                     "name": spec.name,

@@ -5,6 +5,7 @@ import copy
 import dataclasses
 import functools
 import importlib
+import inspect
 import json
 import sys
 from collections.abc import Callable, Mapping
@@ -154,7 +155,7 @@ class EnvSpec:
     """Any id that `gymnasium.make` takes, also `"module:Env-v0"`; or what makes the environment,
     a class or a function. It takes the options as keywords and, to be filmed, `render_mode`."""
     make_task: Callable[..., Task]
-    """Builds the Task; takes the options as keywords."""
+    """Builds the Task; takes those of the options as keywords that it depends on."""
     sim_params: SimParamSets
     """Physics to train on and to test on; passed to `reset` as `options["sim_params"]`."""
     episode_length: int
@@ -162,7 +163,7 @@ class EnvSpec:
     default_sim_params: Mapping[str, float]
     """The physics of the unchanged environment."""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Options of the environment and its Task, with their defaults; anything that JSON holds."""
+    """Options of the environment, with their defaults; anything that JSON holds."""
     description: str = ""
     """One line for lists."""
     epochs: int = 50
@@ -189,6 +190,12 @@ class EnvSpec:
                 f"environment {self.name!r} has options {shown(self.options)} ({error}), allowed:"
                 " what JSON holds: numbers, texts, true, false, null, lists and tables of them."
             ) from None
+
+    def task(self, options: Mapping[str, Any]) -> Task:
+        """Build the Task with those of the options that it takes."""
+        taken = inspect.signature(self.make_task).parameters
+        every = any(one.kind is one.VAR_KEYWORD for one in taken.values())
+        return self.make_task(**{n: v for n, v in options.items() if every or n in taken})
 
 
 _HOMES = {
@@ -299,7 +306,7 @@ def env_options(config: "Config") -> dict[str, Any]:
 
 def task_of(config: "Config") -> Task:
     """The Task of a run, with its environment's options and spaces."""
-    task = copy.copy(env_spec(config.env).make_task(**env_options(config)))
+    task = copy.copy(env_spec(config.env).task(env_options(config)))
     object.__setattr__(task, "told_spaces", config.spaces)  # its own __init__ may take anything
     return task
 

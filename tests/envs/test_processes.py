@@ -111,6 +111,17 @@ def test_a_reset_that_hangs_is_tried_again_in_the_next_episode(made, tmp_path):
     assert "broken" not in vector.reset(seed=0)[1]
 
 
+@pytest.mark.parametrize("timeout", [{}, {"step_timeout_s": TIMEOUT_S}])
+def test_where_only_one_can_exist_it_is_closed_and_the_setting_is_named(timeout, tmp_path):
+    make = functools.partial(misbehaving.Alone, str(tmp_path / "port"))
+    kind = ProcessVectorEnv if timeout else SequentialVectorEnv
+    with pytest.raises(BadEnvironmentError, match=r"2 of 2 .*set collection.num_episodes to 1"):
+        kind([make] * 2, **timeout)
+    assert not (tmp_path / "port").exists()
+    kind([make], **timeout).close()
+    assert not (tmp_path / "port").exists()
+
+
 @pytest.mark.parametrize(
     ("how", "says"),
     [("fail", "raised ZeroDivisionError: a simulator failed"), ("fail_oddly", "OddError: odd")],

@@ -153,8 +153,7 @@ def own(run_dir, tmp_path):
 
     def begin(make_env, **changes):
         sets = SimParamSets({"drift": Uniform(0.5, 1)}, {"far": {"drift": (3.0,)}})
-        task = lambda **options: PendulumTask()  # noqa: E731 (of the same sizes)
-        register(EnvSpec("own", make_env, task, sets, 20, {"drift": 1.0}, {"how": ""}))
+        register(EnvSpec("own", make_env, PendulumTask, sets, 20, {"drift": 1.0}, {"how": ""}))
         run = RunDir(tmp_path / "own")
         run.begin(make_config("own", preset="smoke", settings=changes))
         return run.path

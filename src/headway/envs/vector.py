@@ -379,10 +379,10 @@ def _answer(env: gymnasium.Env, method: str, *given: Any) -> Any:
     """Call a method of an environment and return what matters of the answer.
 
     `reset` gives observation, simulator parameters and spaces; `step`, maybe after a change of
-    simulator parameters, all but the infos; `render` a picture.
+    simulator parameters, all but the infos; `render` a picture; `close` nothing.
     """
-    if method == "render":
-        return env.render()
+    if method in ("render", "close"):
+        return getattr(env, method)()
     if method == "reset":
         try:
             found = env.reset(seed=given[0], options=given[1])
@@ -511,7 +511,11 @@ class ProcessVectorEnv(SequentialVectorEnv):
         return {i: answer for i, answer in answers.items() if i not in self._broken}
 
     def close_extras(self, **kwargs: Any) -> None:
-        """End the processes."""
+        """Close the environments that are not in the middle of something; end all processes."""
+        for env in self._living.values():
+            with contextlib.suppress(Exception):  # it hangs or is gone
+                env.call_async("answer", "close")
+                env.call_wait(timeout=self._timeout_s)
         self._end()
 
 
