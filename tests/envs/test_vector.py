@@ -191,9 +191,9 @@ def test_an_environment_is_named_as_gymnasium_names_it_or_by_what_makes_it(env_i
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"reset": lambda self: self.reset()}, "reset takes no seed or options .* shimmy"),
-        ({"reset": lambda self, **given: np.zeros(3)}, "reset returns no .* shimmy"),
-        ({"step": lambda self, action: (action, 0.0, False, {})}, "step returns 4 .* shimmy"),
+        ({"reset": lambda self: self.reset()}, "argument 'seed'.* shimmy"),
+        ({"reset": lambda self, **given: np.zeros(3)}, "returned no .* shimmy"),
+        ({"step": lambda self, action: (action, 0.0, False, {})}, "got 4.* shimmy"),
         ({"observation_space": gymnasium.spaces.Tuple([])}, "FlattenObservation"),
     ],
 )

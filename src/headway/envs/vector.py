@@ -381,38 +381,37 @@ def _answer(env: gymnasium.Env, method: str, *given: Any) -> Any:
     `reset` gives observation, simulator parameters and spaces; `step`, maybe after a change of
     simulator parameters, all but the infos; `render` a picture; `close` nothing.
     """
-    if method in ("render", "close"):
-        return getattr(env, method)()
-    if method == "reset":
-        try:
+    try:
+        if method in ("render", "close"):
+            return getattr(env, method)()
+        if method == "reset":
             found = env.reset(seed=given[0], options=given[1])
-        except TypeError as error:
-            if re.search(r"keyword argument '(seed|options)'", str(error)):
-                raise _old(f"reset takes no seed or options ({error})") from error
-            raise
-        if not (isinstance(found, tuple) and len(found) == 2):
-            raise _old("reset returns no (obs, info)")
-        obs, info = found
-        return obs, info.get("sim_params", {}), (env.observation_space, env.action_space)
-    action, changed = given
-    if changed:
-        if not env.has_wrapper_attr("set_sim_params"):
-            raise ConfigError(
-                "schedule was given, but the environment has no method set_sim_params(values); add"
-                " one, or leave the schedule out."
-            )
-        env.get_wrapper_attr("set_sim_params")(changed)
-    found = env.step(action)
-    if len(found) != 5:
-        raise _old(f"step returns {len(found)} values, not 5 with terminated and truncated")
-    return found[:4]
+            if not (isinstance(found, tuple) and len(found) == 2):
+                raise TypeError("reset returned no (obs, info)")
+            obs, info = found
+            return obs, info.get("sim_params", {}), (env.observation_space, env.action_space)
+        action, changed = given
+        if changed:
+            if not env.has_wrapper_attr("set_sim_params"):
+                raise ConfigError(
+                    "schedule was given, but the environment has no method set_sim_params(values);"
+                    " add one, or leave the schedule out."
+                )
+            env.get_wrapper_attr("set_sim_params")(changed)
+        obs, reward, terminated, truncated, _ = env.step(action)
+        return obs, reward, terminated, truncated
+    except (TypeError, ValueError) as error:
+        if _OF_OLD_GYM.search(str(error)):
+            raise BadEnvironmentError(
+                f"an environment has the reset or step of old Gym ({error}), allowed:"
+                " reset(seed=None, options=None) that returns (obs, info), and a step that returns"
+                " (obs, reward, terminated, truncated, info); rewrite it, or wrap it with"
+                " GymV21CompatibilityV0 of the package shimmy."
+            ) from error
+        raise
 
 
-def _old(what: str) -> BadEnvironmentError:
-    return BadEnvironmentError(
-        f"an environment's {what}, as in old Gym, allowed: environments of Gymnasium; rewrite it,"
-        " or wrap it with GymV21CompatibilityV0 of the package shimmy."
-    )
+_OF_OLD_GYM = re.compile(r"keyword argument '(seed|options)'|no \(obs, info\)|expected 5, got 4")
 
 
 class ProcessVectorEnv(SequentialVectorEnv):
