@@ -21,12 +21,11 @@ QUANTILES = 5
 class Uniform:
     """A range of a parameter's values, from which training draws evenly; in JSON a table.
 
-    Tests go through evenly spaced values of it, both ends among them.
+    Tests go through evenly spaced values of it, both ends among them; five stand for it in lists.
 
     Example:
-        >>> sets = SimParamSets({"mass": Uniform(0.5, 2.5)})
-        >>> sets.spread("train", 3)
-        [{'mass': 2.5}, {'mass': 1.5}, {'mass': 0.5}]
+        >>> SimParamSets({"mass": Uniform(0.5, 2.5)}).group("train")
+        [{'mass': 0.5}, {'mass': 1.0}, {'mass': 1.5}, {'mass': 2.0}, {'mass': 2.5}]
 
     Raises:
         ConfigError: An end is no finite number, or they are not in order.
