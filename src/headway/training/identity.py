@@ -30,7 +30,7 @@ def identity(config: Config) -> dict[str, Any]:
     if config.env in BUILT_IN:
         return {}
     spec, options = env_spec(config.env), env_options(config)
-    task, environment = spec.make_task(**options), _environment(spec.env_id)
+    task, environment = spec.task(options), _environment(spec.env_id)
     owners = [*type(task).__mro__, *getattr(environment, "__mro__", [environment])]
     modules = {config.env.partition(":")[0], *(str(owner.__module__) for owner in owners if owner)}
     found = {
