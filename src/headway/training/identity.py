@@ -14,7 +14,7 @@ import equinox as eqx
 
 from headway.config import Config, flatten
 from headway.errors import shown
-from headway.task import BUILT_IN, env_options, env_spec, episode_length, sim_param_sets
+from headway.task import BUILT_IN, env_options, env_spec, episode_length, sim_param_sets, task_of
 
 SOURCE = "source."
 STDLIB = Path(inspect.__file__).parent
@@ -29,8 +29,7 @@ def identity(config: Config) -> dict[str, Any]:
     """
     if config.env in BUILT_IN:
         return {}
-    spec, options = env_spec(config.env), env_options(config)
-    task, environment = spec.task(options), _environment(spec.env_id)
+    task, environment = task_of(config), _environment(env_spec(config.env).env_id)
     owners = [*type(task).__mro__, *getattr(environment, "__mro__", [environment])]
     modules = {config.env.partition(":")[0], *(str(owner.__module__) for owner in owners if owner)}
     found = {
@@ -38,7 +37,7 @@ def identity(config: Config) -> dict[str, Any]:
         "environment": environment and f"{environment.__module__}.{environment.__qualname__}",
         "sim_params": sim_param_sets(config).to_dict(),
         "episode_length": episode_length(config),
-        "options": options,
+        "options": env_options(config),
         "source": {name: _digest(file) for name in sorted(modules) if (file := _file(name))},
     }
     return json.loads(json.dumps(found))
