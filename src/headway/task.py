@@ -169,8 +169,8 @@ class EnvSpec:
     epochs: int = 50
     """Passes over the data per iteration at the paper's scale (supplement A.2)."""
     noise_beta: float | None = None
-    """Exponent of the power spectrum of the noise with which iCEM searches in the preset `fast`;
-    None searches with CEM, whose noise is white."""
+    """Exponent of the power spectrum of the noise with which iCEM searches in the presets `fast`
+    and `quick`; None searches with CEM, whose noise is white."""
     obs_names: tuple[str, ...] = ()
     """Entries of an observation with their units, for figures; unnamed ones are numbered."""
 

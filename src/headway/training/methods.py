@@ -168,12 +168,11 @@ SMALL_SEARCH = {
 }
 
 
-def _fast(spec: EnvSpec) -> Settings:
-    settings = {"fitting.epochs": spec.epochs, **SMALL_SEARCH}
+def _small_search(spec: EnvSpec) -> Settings:
     if spec.noise_beta is None:
-        return settings
+        return SMALL_SEARCH
     return {
-        **settings,
+        **SMALL_SEARCH,
         "planner.optimizer.name": "icem",
         "planner.optimizer.num_elites": 10,
         "planner.optimizer.noise_beta": spec.noise_beta,
@@ -205,7 +204,7 @@ def _quick(spec: EnvSpec) -> Settings:
         "fitting.warmup_iterations": 2,
         "fitting.relation_transitions": 20,
         "planner.horizon": 20,
-        **SMALL_SEARCH,
+        **_small_search(spec),
         "evaluation.every": 5,
         "evaluation.num_episodes": 8,
     }
@@ -239,7 +238,11 @@ _PRESETS = (
         "the supplement's numbers; wants a GPU",
         lambda spec: {"fitting.epochs": spec.epochs, **PAPERS_SEARCH},
     ),
-    Preset("fast", "the paper's, but for a planner of at most a tenth of its arithmetic", _fast),
+    Preset(
+        "fast",
+        "the paper's, but for a planner of at most a tenth of its arithmetic",
+        lambda spec: {"fitting.epochs": spec.epochs, **_small_search(spec)},
+    ),
     Preset("quick", "a smaller network, planner and schedule; minutes on a laptop", _quick),
     Preset("smoke", "tiny sizes that only show that everything runs; seconds", _smoke),
     Preset(
