@@ -109,7 +109,8 @@ def _bounds(environments: Environments) -> str:
     """Say what is wrong with the bounds of actions, if anything is."""
     task, space = environments.task, environments.vector.single_action_space
     mine = np.array([task.action_low, task.action_high], np.float64)
-    theirs = np.array([getattr(space, "low", mine[0]), getattr(space, "high", mine[1])])
+    bounds = getattr(space, "low", mine[0]), getattr(space, "high", mine[1])
+    theirs = np.stack(bounds).reshape(2, -1)
     told = f"action_low is {task.action_low} and action_high {task.action_high}, allowed: "
     if mine.shape != theirs.shape or not np.isfinite(mine).all() or (mine[0] >= mine[1]).any():
         return f"{told}finite numbers, low below high, for each action."

@@ -1,5 +1,6 @@
 """What of an environment of your own decides a run's numbers: its settings and its source."""
 
+import dataclasses
 import hashlib
 import importlib.util
 import inspect
@@ -32,8 +33,12 @@ def identity(config: Config) -> dict[str, Any]:
     task, environment = task_of(config), _environment(env_spec(config.env).env_id)
     owners = [*type(task).__mro__, *getattr(environment, "__mro__", [environment])]
     modules = {config.env.partition(":")[0], *(str(owner.__module__) for owner in owners if owner)}
+    fields = {
+        field.name: eqx.tree_pformat(getattr(task, field.name), short_arrays=False)
+        for field in dataclasses.fields(task)
+    }
     found = {
-        "task": f"{type(task).__module__}.{eqx.tree_pformat(task, short_arrays=False)}",
+        "task": {"class": f"{type(task).__module__}.{type(task).__qualname__}", **fields},
         "environment": environment and f"{environment.__module__}.{environment.__qualname__}",
         "sim_params": sim_param_sets(config).to_dict(),
         "episode_length": episode_length(config),
