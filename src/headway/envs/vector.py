@@ -285,7 +285,7 @@ class SequentialVectorEnv(HeadwayVectorEnv):
         self._sets, self._changes = sim_params, {}
         self._obs: list[Any] = [np.zeros(spaces[0][0].shape or ()) for _ in spaces]
         self.told: list[SimParams] = [{} for _ in spaces]
-        """What each environment said at its reset that its simulator parameters are."""
+        """Simulator parameters as each environment itself told them at its reset."""
 
     def _make_all(self, env_fns: Makers) -> Iterable[Any]:
         return (gymnasium.Wrapper(make()) for make in env_fns)  # which refuses what is no Env

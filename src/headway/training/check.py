@@ -181,7 +181,7 @@ class _Trials:
     broken: list[str] = dataclasses.field(default_factory=list)
     """Why the other episodes are left out."""
     told: dict[str, list[tuple[Any, Any]]] = dataclasses.field(default_factory=dict)
-    """What was asked for, and what `reset` told, by name of the parameter."""
+    """Values asked for, and what `reset` told, by name of the parameter."""
 
     def act(self, physics: dict[str, float], steps: int, seed: int = 0) -> np.ndarray | None:
         """Run an episode; its observations, or None if it broke."""

@@ -1,4 +1,4 @@
-"""What of an environment of your own decides a run's numbers: its settings and its source."""
+"""Identity of an environment of your own: the settings and the source that decide numbers."""
 
 import dataclasses
 import hashlib
