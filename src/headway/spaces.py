@@ -1,4 +1,4 @@
-"""What an environment observes and takes, as data: sizes, bounds, and how actions are scaled."""
+"""Observation and action space of an environment, as data, and the scaling of its actions."""
 
 import dataclasses
 from typing import Any, Literal
@@ -66,6 +66,6 @@ class Spaces:
         return (np.array(self.action_high) - self.action_low).astype(int) + 1
 
     def _ends(self, xp: Any) -> tuple[Any, Any]:
-        """What -1 and 1 stand for. Half beyond, so that the outer integers get a whole share."""
+        """Numbers of -1 and 1; half beyond the outer integers, which so get a whole share."""
         low, high = xp.asarray(self.action_low), xp.asarray(self.action_high)
         return (low - 0.5, high + 0.5) if self.action_kind == "integers" else (low, high)

@@ -59,7 +59,7 @@ class Task(eqx.Module):
     action_low: ClassVar[tuple[float, ...]]
     action_high: ClassVar[tuple[float, ...]]
     told_spaces: Spaces | None = eqx.field(static=True, default=None, kw_only=True)
-    """What a run read from its environment."""
+    """The spaces that a run read from its environment."""
 
     if not TYPE_CHECKING:  # which would take every misspelt name for one of these
 

@@ -164,6 +164,14 @@ class Agent(eqx.Module):
         """The decision, by the search as it is now."""
         return _decide(self, plan)
 
+    def shift(self, search: Any) -> Any:
+        """The start of the search one step later.
+
+        A category that all elites had leads by half only: the others would not be drawn again.
+        """
+        start, ordered = self.optimizer.shift(search), self.task.spaces.action_kind != "categories"
+        return start if ordered else start._replace(nominal=0.5 * start.nominal)
+
     def _num_shards(self, num_envs: int) -> int:
         planner = self.planner
         per_env = planner.num_candidates * planner.num_particles * planner.horizon
@@ -183,7 +191,7 @@ def observe(agent: Agent, state: AgentState, obs: Float[Array, "env obs"]) -> Pl
 def decide(agent: Agent, plan: Plan) -> tuple[AgentState, Decision]:
     """Take a plan's first action; where its search ended, one step later, is the next start."""
     search, acted = plan.search, jnp.ones(len(plan.obs), bool)
-    action, start = search.actions[:, 0], agent.optimizer.shift(search)
+    action, start = search.actions[:, 0], agent.shift(search)
     action = agent.task.project_action(action)
     state = AgentState(plan.belief, plan.obs, action, acted, start, plan.next_key)
     heads = getattr(plan.belief, "heads", None)
@@ -240,6 +248,6 @@ def open_loop(agent: Agent, state: AgentState) -> AgentState:
         agent: It plans.
         state: Its state.
     """
-    search, unseen = agent.optimizer.shift(state.search), jnp.zeros_like(state.acted)
+    search, unseen = agent.shift(state.search), jnp.zeros_like(state.acted)
     action = agent.task.project_action(state.search.nominal[:, 0])
     return state._replace(action=action, acted=unseen, search=search)

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
-from headway.config import LARGEST, Config, differences, tolerating_as
+from headway.config import LARGEST, Config, differences
 from headway.data import Trajectory
 from headway.errors import BadEnvironmentError, HeadwayError, shown
 from headway.planning.agent import Agent
@@ -113,7 +113,7 @@ def _task_in(config: Config, read: Spaces) -> Task:
         )
     spaces = dataclasses.replace(read, action_low=low, action_high=high)
     told = dataclasses.replace(config, spaces=spaces)
-    if changed := differences(tolerating_as(config, told), told):
+    if config.spaces and (changed := differences(config, told)):
         raise BadEnvironmentError(
             f"{config.env} has other spaces than its run ({'; '.join(changed)}); bring them back,"
             " or train another run."
