@@ -285,7 +285,7 @@ class CEMConfig(OptimizerConfig):
     """Standard deviation of the first candidates, actions being scaled to [-1, 1]."""
     narrow_at_bounds: Flag = False
     """Candidates spread less near the bounds (the paper's way), where plans then stay for many
-    steps after what is best has changed; otherwise they are truncated there."""
+    steps after what is best has changed; otherwise they are clipped."""
 
 
 @settings

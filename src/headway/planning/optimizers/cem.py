@@ -19,22 +19,18 @@ class CEM(Optimizer):
     narrow_at_bounds: bool = False
 
     def ask(self, search, key, iteration=0):
-        """See `Optimizer.ask`: a normal truncated at two deviations and at ±1.
+        """See `Optimizer.ask`: a normal truncated at two deviations, and clipped to ±1.
 
         The paper narrows it instead, until ±1 is two deviations away. Near a bound hardly
         anything else is drawn then, and a plan stays there after what is best has changed.
         """
-        mean, std = search.nominal[:, None], search.std[:, None]
-        low, high = -2.0, 2.0
+        mean, std = search.nominal, search.std
         if self.narrow_at_bounds:
             room = jnp.minimum((mean + 1) / 2, (1 - mean) / 2)
             std = jnp.minimum(jnp.abs(room), std)
-        else:
-            unit = jnp.maximum(std, jnp.finfo(std.dtype).tiny)  # 0 / 0 at a bound otherwise
-            low = jnp.maximum(low, (-1 - mean) / unit)
-            high = jnp.minimum(high, (1 - mean) / unit)
-        shape = len(mean), self.num_candidates, *mean.shape[2:]
-        return mean + std * jax.random.truncated_normal(key, low, high, shape)
+        shape = len(mean), self.num_candidates, *mean.shape[1:]
+        draws = jax.random.truncated_normal(key, -2.0, 2.0, shape)
+        return jnp.clip(mean[:, None] + std[:, None] * draws, -1.0, 1.0)
 
     def tell(self, search, candidates, returns):
         """See `Optimizer.tell`: elites are the best candidates, of a finite return only."""
