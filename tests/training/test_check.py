@@ -78,8 +78,8 @@ def cart(monkeypatch):
 
 MISSPELT = headway.SimParamSets({"mass": (0.5, 2.0), "mas": (1.0, 2.0)})
 TASKS = [
-    ({"action_high": (np.inf,)}, "action bounds", "finite numbers, low below high"),
-    ({"action_low": (3.0,), "action_high": (-3.0,)}, "action bounds", "low below high"),
+    ({"action_high": (np.inf,)}, "environment", "finite bounds"),
+    ({"action_low": (3.0,), "action_high": (-3.0,)}, "environment", "the lower one first"),
     ({"action_high": (1.0,)}, "action bounds", r"the environment's bounds, \[-3.\] and \[3.\]"),
     ({"reward": lambda s, o, a, n: 1.0 if n[..., 0] > 0 else 0.0}, "Task.reward", "jnp.where"),
     ({"reward": lambda s, o, a, n: np.sqrt(n[..., 0])}, "Task.reward", "call of NumPy"),

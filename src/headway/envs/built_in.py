@@ -473,7 +473,7 @@ def read_spaces(obs: gymnasium.Space, action: gymnasium.Space) -> Spaces:
     Raises:
         BadEnvironmentError: Observations are no row of numbers, or actions of another kind.
     """
-    if obs.shape is None or len(obs.shape) != 1:
+    if len(obs.shape or ()) != 1:
         raise BadEnvironmentError(
             f"the environment has the observation space {obs}, allowed: numbers in one row; wrap"
             " it in gymnasium.wrappers.FlattenObservation."
