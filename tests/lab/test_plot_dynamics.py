@@ -1,7 +1,7 @@
 import numpy as np
 
 from headway.lab.dynamics import choose_views, collect_changes
-from headway.task import env_names, env_spec
+from headway.task import BUILT_IN, env_spec
 
 
 def test_the_views_are_the_numbers_that_tell_physics_apart():
@@ -24,7 +24,7 @@ def test_only_the_physics_differ_between_the_changes():
 
 
 def test_names_of_observations_fit_the_environments():
-    for name in env_names():
+    for name in BUILT_IN:
         spec = env_spec(name)
         size = spec.make_task(**spec.options).obs_size
         assert len(set(spec.obs_names)) == len(spec.obs_names) == size

@@ -156,8 +156,10 @@ def test_a_run_of_another_environment_is_refused(cart, tmp_path, monkeypatch):
     """Whatever of it changed: the Task, the physics, the class or its source."""
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "edited_cart", raising=False)
-    module = tmp_path / "edited_cart.py"
-    module.write_text("import test_check\n\nclass Cart(test_check.Cart):\n    gain = 1\n")
+    source = "import test_check, edited_gain\nclass Cart(test_check.Cart): gain = edited_gain.GAIN"
+    (tmp_path / "edited_cart.py").write_text(source)
+    module = tmp_path / "edited_gain.py"
+    module.write_text("GAIN = 1\n")
     cart(GoalTask, entry="edited_cart:Cart")
     path = random_run(tmp_path / "run").path
     other = headway.SimParamSets({"mass": (1.0, 3.0)})
@@ -171,8 +173,8 @@ def test_a_run_of_another_environment_is_refused(cart, tmp_path, monkeypatch):
             random_run(path)
     cart(GoalTask, entry="edited_cart:Cart")
     module.write_text(module.read_text().replace("1", "2"))
-    with pytest.raises(RunError, match=r"source of edited_cart changed: edited_cart\.py"):
+    with pytest.raises(RunError, match=r"source of edited_gain changed: edited_gain\.py"):
         random_run(path)
-    with pytest.warns(UserWarning, match="source of edited_cart changed"):
+    with pytest.warns(UserWarning, match="source of edited_gain changed"):
         headway.evaluate(path, groups=["heavy"])
     random_run(path, **{"collection.check": False})

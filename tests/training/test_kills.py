@@ -105,7 +105,7 @@ def test_a_finished_run_goes_on_to_more_iterations_wherever_it_is_killed(tmp_pat
         with pytest.raises(Killed):
             train_until(Places(place), path, monkeypatch, config=longer)
         run = train.train_run(longer, path)
-        assert run.config() == longer
+        assert run.config().collection == longer.collection
         assert runs.result(path) == runs.result(tmp_path / "whole")
     with pytest.raises(RunError, match=r"collection\.num_iterations: 2 -> 1"):
         train.train_run(short, path)

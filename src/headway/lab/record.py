@@ -115,7 +115,7 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
         for step in range(1, length + 1):
             action = controller.act(obs[0])
             with raising(config.env, f"step {step}"):
-                obs, reward, terminated, truncated, info = env.step(action[None])
+                obs, reward, terminated, truncated, info = env.step(np.asarray(action)[None])
                 if "broken" in info:
                     raise BadEnvironmentError(f"it broke, {info['broken'][0]}")
                 (image,) = env.render()

@@ -1,12 +1,13 @@
 """Identity of an environment of your own: the settings and the source that decide numbers."""
 
+import ast
 import dataclasses
 import hashlib
 import importlib.util
 import inspect
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -25,14 +26,14 @@ def identity(config: Config) -> dict[str, Any]:
     """Describe an environment of your own, for JSON; nothing for a built-in one.
 
     Of the source it has the modules of the EnvSpec, of the Task and of the environment, with
-    their base classes; what is installed is left out. Where Gymnasium is not loaded, as in a
-    controller, the environment itself is not known.
+    their base classes and the modules that these use; what is installed is left out. Where
+    Gymnasium is not loaded, as in a controller, the environment itself is not known.
     """
     if config.env in BUILT_IN:
         return {}
     task, environment = task_of(config), _environment(env_spec(config.env).env_id)
     owners = [*type(task).__mro__, *getattr(environment, "__mro__", [environment])]
-    modules = {config.env.partition(":")[0], *(str(owner.__module__) for owner in owners if owner)}
+    modules = [config.env.partition(":")[0], *(str(owner.__module__) for owner in owners if owner)]
     fields = {
         field.name: eqx.tree_pformat(getattr(task, field.name), short_arrays=False)
         for field in dataclasses.fields(task)
@@ -43,9 +44,36 @@ def identity(config: Config) -> dict[str, Any]:
         "sim_params": sim_param_sets(config).to_dict(),
         "episode_length": episode_length(config),
         "options": env_options(config),
-        "source": {name: _digest(file) for name in sorted(modules) if (file := _file(name))},
+        "source": {name: _digest(file) for name, file in sorted(_sources(modules).items())},
     }
     return json.loads(json.dumps(found))
+
+
+def _sources(modules: list[str]) -> dict[str, Path]:
+    """The files of modules and of all that these import, as far as they are the user's own."""
+    found: dict[str, Path] = {}
+    for module in modules:  # which grows
+        file = _file(module)
+        if module in found or file is None:
+            continue
+        found[module] = file
+        if (
+            module != "__main__" and file.suffix == ".py"
+        ):  # a script also imports what it trains with
+            package = getattr(sys.modules.get(module), "__package__", None)
+            modules += [name for name in _imported(file, package or "") if name in sys.modules]
+    return found
+
+
+def _imported(file: Path, package: str) -> Iterator[str]:
+    """Names that a file imports, be they of modules or of what these hold."""
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            name = "." * node.level + (node.module or "")
+            base = importlib.util.resolve_name(name, package)
+            yield from (base, *(f"{base}.{alias.name}" for alias in node.names))
 
 
 def changes(before: Mapping[str, Any], config: Config) -> list[str]:
@@ -67,7 +95,7 @@ def changes(before: Mapping[str, Any], config: Config) -> list[str]:
 def _environment(env_id: Any) -> Any:
     """The class or function that makes an environment; None where it is not known."""
     gymnasium = sys.modules.get("gymnasium")
-    found = gymnasium and gymnasium.registry.get(env_id)
+    found = gymnasium and gymnasium.registry.get(str(env_id).rpartition(":")[2])
     entry = found.entry_point if found else env_id
     if isinstance(entry, str):
         module, _, name = entry.partition(":")
