@@ -2,11 +2,14 @@
 
 import os
 
+import jaxlib
+
 # Most of the time goes to compiling small programs that run once: LLVM need not optimise them.
+# What newer versions of jaxlib do not know stops them.
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-    " --xla_cpu_use_fusion_emitters=false",
+    + " --xla_cpu_use_fusion_emitters=false" * jaxlib.__version__.startswith("0.10"),
 )
 
 import jaxtyping
