@@ -86,7 +86,8 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
     """
     prepare_jax()
     config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
-    path = run_dir or Path("runs") / f"{config.env}-{method}-{preset}-seed{seed}"
+    name = f"{config.env}-{method}-{preset}-seed{seed}".replace(":", "-")
+    path = run_dir or Path("runs") / name
     run = train_run(
         config, path, progress, on_iteration, resume_from_last_good=resume_from_last_good
     )

@@ -11,6 +11,7 @@ import re
 import shlex
 import sys
 import typing
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -682,6 +683,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"headway {__version__}")
         return 0
     stopped, code = "", 1
+    warnings.formatwarning = lambda text, *_, **__: f"warning: {text}\n"
     try:
         command = parse(words)
         if not isinstance(command, List):

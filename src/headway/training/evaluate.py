@@ -1,7 +1,7 @@
 """Testing a controller on training and unseen physics (supplement A.2)."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from headway.config import Config, differences, override, tolerating_as
 from headway.data import Trajectory
-from headway.errors import unknown_name
+from headway.errors import ConfigError, unknown_name
 from headway.models.compilation import prepare_jax
 from headway.planning.agent import Agent
 from headway.planning.rollouts import plan_flop
@@ -134,7 +134,12 @@ def iteration_keys(config: Config, iteration: int) -> PRNGKeyArray:
 
 
 def run_tests(
-    agent: Agent, wanted: Sequence[str], groups: Sequence[str], batches: Batches, key: PRNGKeyArray
+    agent: Agent,
+    wanted: Sequence[str],
+    groups: Sequence[str],
+    batches: Batches,
+    key: PRNGKeyArray,
+    begin: Callable[[int], Any],
 ) -> Tests:
     """Run the test episodes of some groups, as many side by side as a batch holds.
 
@@ -144,6 +149,7 @@ def run_tests(
         groups: The same or more, in the order that decides which draws an episode gets.
         batches: Runs them.
         key: The planner's draws.
+        begin: Called with the environment steps to come.
 
     Raises:
         BadEnvironmentError: More episodes broke than allowed, or all of a group.
@@ -159,11 +165,12 @@ def run_tests(
     ]
     found: dict[str, dict[int, Trajectory]] = {group: {} for group in wanted}
     use, seconds = PlannerUse(), 0.0
-    for chunk, start in enumerate(range(0, len(asked), size)):
-        batch, chunk_key = asked[start : start + size], jax.random.fold_in(key, chunk)
+    chunks = dict(enumerate(asked[start : start + size] for start in range(0, len(asked), size)))
+    chunks = {c: batch for c, batch in chunks.items() if {*wanted} & {group for group, *_ in batch}}
+    begin(sum(map(len, chunks.values())) * environments.episode_length)
+    for chunk, batch in chunks.items():
+        chunk_key = jax.random.fold_in(key, chunk)
         ours = [episode for group, _, episode in batch if group in wanted]
-        if not ours:
-            continue
         # Every place has draws of its own, so the episodes that are wanted keep theirs.
         episodes = [episode if group in wanted else ours[0] for group, _, episode in batch]
         policy = partial(agent_policy, agent, size, episodes, key=chunk_key)
@@ -225,6 +232,9 @@ def evaluate(
     tested = [row.group for row in run.evaluation() if row.iteration == number]
     if sim_params:
         sets = sim_param_sets(config)
+        for name in sim_params:
+            if name not in sets.names:
+                raise ConfigError(str(unknown_name("sim_param", name, sets.names)))
         custom = {**sets.train, **{name: np.atleast_1d(v) for name, v in sim_params.items()}}
         physics = {"train": sets.train, "unseen": {**sets.unseen, CUSTOM: custom}}
         config, groups = override(config, {"sim_params": physics}), [*(groups or ()), CUSTOM]
@@ -234,12 +244,11 @@ def evaluate(
         wanted = known_groups(groups, known)
         if new := changed or [f"{group} was not tested" for group in wanted if group not in tested]:
             shown.message(f"New draws, not those of iteration {number}'s tests: {'; '.join(new)}.")
-        total = len(wanted) * config.evaluation.num_episodes * environments.episode_length
-        shown.phase("evaluate", total)
         batches = Batches(environments, config, "evaluation", shown.advance, shown.message)
         seed = config.evaluation.seed
         key = jax.random.key(seed) if changed else iteration_keys(config, number)[2]
-        tests = run_tests(agent, wanted, list(dict.fromkeys([*tested, *known])), batches, key)
+        order, begin = list(dict.fromkeys([*tested, *known])), partial(shown.phase, "evaluate")
+        tests = run_tests(agent, wanted, order, batches, key, begin)
     use = tests.use
     evaluations = use.evaluations / use.steps
     cost = PlanningCost(

@@ -4,6 +4,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -282,10 +283,11 @@ class _Training:
         groups = self.groups()
         if not groups:
             return Tests()
-        num_tests = len(groups) * self.config.evaluation.num_episodes
-        self.begin_phase("evaluate", num_tests * self.environments.episode_length)
-        agent = self.trainer.agent(self.state, self.data)
-        return run_tests(agent, groups, groups, self.batches("evaluation"), key)
+        agent, begin = (
+            self.trainer.agent(self.state, self.data),
+            partial(self.begin_phase, "evaluate"),
+        )
+        return run_tests(agent, groups, groups, self.batches("evaluation"), key, begin)
 
 
 def divergence(stats: EpochStats, before: Sequence[EpochStats]) -> str | None:
