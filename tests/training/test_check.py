@@ -4,6 +4,7 @@ import json
 import re
 import sys
 
+import equinox as eqx
 import gymnasium
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +14,7 @@ from gymnasium.wrappers import NormalizeObservation
 import headway
 from headway import task
 from headway.cli import main
-from headway.errors import BadEnvironmentError, RunError
+from headway.errors import BadEnvironmentError, BrokenEpisodeError, RunError
 
 SETS = headway.SimParamSets({"mass": (0.5, 2.0)}, {"heavy": {"mass": (4.0,)}})
 
@@ -24,15 +25,20 @@ class Cart(gymnasium.Env):
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
     action_space = gymnasium.spaces.Box(-3, 3, (1,), np.float64)
 
+    resets = 0
+
     def __init__(self, deaf=False, lies=0.0, unseeded=0.0, offset=0.0, ends=np.inf, lost=np.inf):
         self.deaf, self.lies, self.unseeded, self.ends, self.lost = deaf, lies, unseeded, ends, lost
         self.offset = np.array([offset, 0.0])
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
+        self.steps, self.resets = 0, self.resets + 1
         self.mass = 1.0 if self.deaf else options["sim_params"]["mass"]
+        if self.mass > self.lost:
+            raise BrokenEpisodeError("too heavy")
         unseeded = np.random.default_rng().uniform(size=2)
-        self.state = self.np_random.uniform(-1, 1, 2) + self.unseeded * unseeded
+        self.state = self.np_random.uniform(-1, 1, 2) + max(self.unseeded, 0) * unseeded
         told = {} if self.deaf else {"sim_params": {"mass": self.mass + self.lies}}
         return self.state + self.offset, told
 
@@ -41,7 +47,9 @@ class Cart(gymnasium.Env):
         self.state = np.array([self.state[0] + 0.1 * velocity, velocity])
         seen = self.state + self.offset
         seen[1] += np.nan if abs(velocity) > self.lost else 0.0
-        return seen, -float(seen[0] ** 2), bool(abs(velocity) > self.ends), False, {}
+        self.steps += 1
+        cut = self.unseeded < 0 and self.steps > 20 // self.resets
+        return seen, -float(seen[0] ** 2), bool(abs(velocity) > self.ends), cut, {}
 
 
 class CartTask(headway.Task):
@@ -99,6 +107,7 @@ ENVS = [
     ({"lies": 1.0}, "mass", r"Asked for 0.5, info\['sim_params'\] says 1.5"),
     ({"sets": MISSPELT}, "mas", "changes no observation"),
     ({"unseeded": 0.1}, "repeats", "self.np_random"),
+    ({"unseeded": -1}, "repeats", "gave another episode"),  # it has another length
     ({"offset": 4e6}, "numbers", r"obs\[0\] is up to 4e\+06"),
     ({"ends": 0.5}, "terminated", "False, allowed: True"),
     ({"lost": 0.5}, "episodes", "allowed: 1 .*returned a non-finite obs"),
@@ -141,6 +150,12 @@ def test_a_fault_stops_before_anything_is_written(cart, tmp_path):
     assert (tmp_path / "run").exists()
 
 
+def test_what_a_lost_episode_told_is_not_compared(cart):
+    found = headway.check(cart(lost=3.0))  # the heavy ones
+    assert [row.name for row in found if row.status == "remark"] == ["schedule", "episodes"]
+    assert not [row for row in found if row.status == "fault"]
+
+
 def test_faults_in_a_process_are_named(cart, tmp_path):
     settings = {"collection.env_processes": True}
     cart(entry="test_check:Cart", lies=1.0)
@@ -149,7 +164,8 @@ def test_faults_in_a_process_are_named(cart, tmp_path):
 
 
 class GoalTask(CartTask):
-    goal: float = 0.0
+    goal: object = 0.0
+    tool: object = eqx.field(static=True, default_factory=object)  # another one each time
 
 
 def test_a_run_of_another_environment_is_refused(cart, tmp_path, monkeypatch):
@@ -166,7 +182,9 @@ def test_a_run_of_another_environment_is_refused(cart, tmp_path, monkeypatch):
     for words, changes in (
         (r"task\.goal: '0\.0' -> '1\.0'", {"make_task": lambda: GoalTask(1.0)}),
         (r"sim_params\.train\.mass: \[0\.5, 2\.0\] -> \[1\.0, 3\.0\]", {"sets": other}),
+        (r"task\.goal: .* -> .*float64\[99\] ", {"make_task": lambda: GoalTask(np.zeros(99))}),
         (r"environment: 'edited_cart\.Cart' -> 'test_check\.Cart'", {"entry": Cart}),
+        (r"environment: .* -> .*Cart{'offset': 1\.0}", {"offset": 1.0}),
     ):
         cart(**{"make_task": GoalTask, "entry": "edited_cart:Cart", **changes})
         with pytest.raises(RunError, match=words):

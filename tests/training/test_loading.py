@@ -68,6 +68,11 @@ def test_the_newest_iterations_and_the_best_are_kept(tmp_path):
     assert [run.kept_iteration(wanted) for wanted in (None, "best", 5)] == [6, 1, 5]
     with pytest.raises(RunError, match="keeps no iteration 2, allowed: 1, 4, 5, 6; "):
         run.kept_iteration(2)
+    for iteration in (4, 5, 6):
+        (tmp_path / f"checkpoints/iteration-00{iteration}.safetensors").write_bytes(b"")
+    assert run.go_back() == 1
+    run.begin(runs.tiny_config())
+    assert run.finished_iterations == 2
 
 
 SERVED = ("config.json", "checksums/iteration-001.json", "checkpoints/iteration-001.safetensors")

@@ -392,27 +392,33 @@ def make(name: str, **kwargs: Any) -> gymnasium.Env:
 
     Args:
         name: For example `"hopper"`, `"headway/Hopper-v0"` or `"my_package:cart"`.
-        **kwargs: The environment's options, `sim_params` (a `SimParamSets`), `render_mode`, and
-            what else `gymnasium.make` takes.
+        **kwargs: Options over those of the spec, `sim_params` (a `SimParamSets`), `render_mode`,
+            and what else `gymnasium.make` takes.
 
     Raises:
         UnknownNameError: No such environment or option.
         gymnasium.error.Error: Gymnasium does not know the environment's id.
     """
-    return _maker(env_spec(name))(**kwargs)
+    spec = env_spec(name)
+    return _maker(spec)(**{**spec.options, **kwargs})
 
 
 def _maker(spec: EnvSpec) -> Callable[..., gymnasium.Env]:
     """What makes the environment from keywords; also in a process that has registered nothing."""
     if not isinstance(spec.env_id, str):
         return spec.env_id
-    module, _, env_id = spec.env_id.rpartition(":")
+    return functools.partial(gymnasium.make, registered(spec.env_id))
+
+
+def registered(env_id: str) -> Any:
+    """What Gymnasium knows of an id, which may name a module and lack a version, as for `make`."""
+    module, _, env_id = env_id.rpartition(":")
     if module:
         importlib.import_module(module)
     namespace, name, version = parse_env_id(env_id)
     if version is None:
         version = find_highest_version(namespace, name)
-    return functools.partial(gymnasium.make, gymnasium.spec(get_env_id(namespace, name, version)))
+    return gymnasium.spec(get_env_id(namespace, name, version))
 
 
 def make_vec(
@@ -433,7 +439,7 @@ def make_vec(
         name: For example `"hopper"`, `"headway/Hopper-v0"` or `"my_package:cart"`.
         num_envs: How many.
         sim_params: Replaces the spec's training and unseen physics.
-        options: Options of the environment.
+        options: Options of the environment, over those of the spec.
         episode_length: Steps after which an episode is cut; None takes the spec's.
         step_timeout_s: Steps every environment in a process of its own, and gives it up when a
             step takes longer (`ProcessVectorEnv`); None steps all in this process.
@@ -446,7 +452,7 @@ def make_vec(
         BadEnvironmentError: An environment could not be made in its process.
     """
     spec = env_spec(name)
-    given: dict[str, Any] = dict(options or {})
+    given: dict[str, Any] = {**spec.options, **(options or {})}
     sets = sim_params or spec.sim_params
     length = spec.episode_length if episode_length is None else episode_length
     world, draws = _WORLDS.get(spec.env_id), None

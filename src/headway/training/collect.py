@@ -78,7 +78,7 @@ class Environments:
         try:
             read = envs.read_spaces(vector.single_observation_space, vector.single_action_space)
             task = _task_in(config, read)
-        except HeadwayError:
+        except Exception:
             vector.close()
             raise
         return cls(config.env, task, vector, sim_params, episode_length(config))

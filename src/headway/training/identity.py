@@ -2,10 +2,12 @@
 
 import ast
 import dataclasses
+import functools
 import hashlib
 import importlib.util
 import inspect
 import json
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -13,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
+import numpy as np
 
 from headway.config import Config, flatten
 from headway.errors import shown
@@ -20,6 +24,7 @@ from headway.task import BUILT_IN, env_options, env_spec, episode_length, sim_pa
 
 SOURCE = "source."
 STDLIB = Path(inspect.__file__).parent
+SHORT = 20  # numbers of an array that are kept as they are
 
 
 def identity(config: Config) -> dict[str, Any]:
@@ -31,16 +36,15 @@ def identity(config: Config) -> dict[str, Any]:
     """
     if config.env in BUILT_IN:
         return {}
-    task, environment = task_of(config), _environment(env_spec(config.env).env_id)
+    task, (environment, keywords) = task_of(config), _environment(env_spec(config.env).env_id)
     owners = [*type(task).__mro__, *getattr(environment, "__mro__", [environment])]
-    modules = [config.env.partition(":")[0], *(str(owner.__module__) for owner in owners if owner)]
+    modules = [config.env.rpartition(":")[0], *(str(owner.__module__) for owner in owners if owner)]
     fields = {
-        field.name: eqx.tree_pformat(getattr(task, field.name), short_arrays=False)
-        for field in dataclasses.fields(task)
+        field.name: _described(getattr(task, field.name)) for field in dataclasses.fields(task)
     }
     found = {
-        "task": {"class": f"{type(task).__module__}.{type(task).__qualname__}", **fields},
-        "environment": environment and f"{environment.__module__}.{environment.__qualname__}",
+        "task": {"class": _name(type(task)), **fields},
+        "environment": environment and _name(environment) + (_described(keywords) * bool(keywords)),
         "sim_params": sim_param_sets(config).to_dict(),
         "episode_length": episode_length(config),
         "options": env_options(config),
@@ -57,9 +61,8 @@ def _sources(modules: list[str]) -> dict[str, Path]:
         if module in found or file is None:
             continue
         found[module] = file
-        if (
-            module != "__main__" and file.suffix == ".py"
-        ):  # a script also imports what it trains with
+        # A script also imports what it trains with.
+        if module != "__main__" and file.suffix == ".py":
             package = getattr(sys.modules.get(module), "__package__", None)
             modules += [name for name in _imported(file, package or "") if name in sys.modules]
     return found
@@ -92,16 +95,37 @@ def changes(before: Mapping[str, Any], config: Config) -> list[str]:
     return lines
 
 
-def _environment(env_id: Any) -> Any:
-    """The class or function that makes an environment; None where it is not known."""
-    gymnasium = sys.modules.get("gymnasium")
-    found = gymnasium and gymnasium.registry.get(str(env_id).rpartition(":")[2])
-    entry = found.entry_point if found else env_id
+def _environment(entry: Any) -> tuple[Any, dict[Any, Any]]:
+    """The class or function that makes an environment, or None, and what it is always given."""
+    keywords: dict[Any, Any] = {}
+    if isinstance(entry, str):
+        env_id, entry = entry, None
+        with suppress(Exception):  # no environment was made yet, or it is registered nowhere
+            found = sys.modules["headway.envs.built_in"].registered(env_id)
+            entry, keywords = found.entry_point, found.kwargs
     if isinstance(entry, str):
         module, _, name = entry.partition(":")
         entry = getattr(sys.modules.get(module), name, None)
-    entry = getattr(entry, "func", entry)  # of a functools.partial
-    return entry if hasattr(entry, "__qualname__") else None
+    if isinstance(entry, functools.partial):
+        entry, keywords = entry.func, dict(enumerate(entry.args)) | entry.keywords
+    return entry if hasattr(entry, "__qualname__") else None, keywords
+
+
+def _name(owner: Any) -> str:
+    return f"{owner.__module__}.{owner.__qualname__}"
+
+
+def _described(value: Any) -> str:
+    """A value in words: a long array by its digest, an object without its address."""
+
+    def shortened(leaf: Any) -> Any:
+        if not isinstance(leaf, np.ndarray | jax.Array) or leaf.size <= SHORT:
+            return leaf
+        content = np.asarray(leaf).tobytes()
+        return f"{leaf.dtype}{list(leaf.shape)} {hashlib.sha256(content).hexdigest()}"
+
+    text = eqx.tree_pformat(jax.tree.map(shortened, value), short_arrays=False)
+    return re.sub(" at 0x[0-9a-f]+", "", text)
 
 
 def _file(module: str) -> Path | None:

@@ -458,9 +458,10 @@ class RunDir:
                 f"{self.path} has no intact iteration to go back to; restore it from a copy, or"
                 " start anew in another directory."
             )
-        for iteration in reversed(numbers):
-            if good is not None and iteration > good:
-                remove(self.path / _name("checksums", iteration))
+        for folder in ("checksums", "checkpoints"):
+            for iteration in reversed(self._numbers(folder)):
+                if good is not None and iteration > good:
+                    remove(self.path / _name(folder, iteration))
         return good
 
     def partial(self) -> "Partial":
