@@ -194,7 +194,6 @@ def test_an_environment_is_named_as_gymnasium_names_it_or_by_what_makes_it(env_i
         ({"reset": lambda self: self.reset()}, "argument 'seed'.* shimmy"),
         ({"reset": lambda self, **given: np.zeros(3)}, "returned no .* shimmy"),
         ({"step": lambda self, action: (action, 0.0, False, {})}, "got 4.* shimmy"),
-        ({"observation_space": gymnasium.spaces.Tuple([])}, "FlattenObservation"),
     ],
 )
 def test_environments_that_cannot_serve_are_named_in_one_line(changes, says):

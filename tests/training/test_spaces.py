@@ -12,7 +12,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tu
 import headway
 from headway import task
 from headway.config import PlannerConfig
-from headway.envs import read_spaces
+from headway.envs.vector import read_spaces
 from headway.errors import BadEnvironmentError, RunError
 from headway.planning.agent import Agent
 from headway.training.collect import Environments

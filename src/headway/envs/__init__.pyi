@@ -5,7 +5,6 @@ from .built_in import HeadwayEnv as HeadwayEnv
 from .built_in import RobotVectorEnv as RobotVectorEnv
 from .built_in import make as make
 from .built_in import make_vec as make_vec
-from .built_in import read_spaces as read_spaces
 from .vector import HeadwayVectorEnv as HeadwayVectorEnv
 from .vector import ProcessVectorEnv as ProcessVectorEnv
 from .vector import SequentialVectorEnv as SequentialVectorEnv

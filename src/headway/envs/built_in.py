@@ -16,14 +16,13 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from gymnasium.envs.registration import find_highest_version, get_env_id, parse_env_id
-from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
+from gymnasium.spaces import Box
 from jaxtyping import Float
 
 from headway.cpus import num_cpus
 from headway.envs.vector import HeadwayVectorEnv, ProcessVectorEnv, SequentialVectorEnv, SimParams
-from headway.errors import BadEnvironmentError, BrokenEpisodeError, ConfigError
+from headway.errors import BrokenEpisodeError, ConfigError
 from headway.sim_params import SimParamSets
-from headway.spaces import Spaces
 from headway.task import EnvSpec, env_spec
 from headway.worlds import classic, locomotion
 from headway.worlds.base import World
@@ -471,36 +470,6 @@ def make_vec(
     if step_timeout_s is None:
         return SequentialVectorEnv([one] * num_envs, **shared)
     return ProcessVectorEnv([one] * num_envs, step_timeout_s=step_timeout_s, **shared)
-
-
-def read_spaces(obs: gymnasium.Space, action: gymnasium.Space) -> Spaces:
-    """Sizes, bounds and kind of an observation and an action space.
-
-    Raises:
-        BadEnvironmentError: Observations are no row of numbers, or actions of another kind.
-    """
-    if len(obs.shape or ()) != 1:
-        raise BadEnvironmentError(
-            f"the environment has the observation space {obs}, allowed: numbers in one row; wrap"
-            " it in gymnasium.wrappers.FlattenObservation."
-        )
-    kind: Any = "categories"
-    match action:
-        case Box(low=low, high=high):
-            kind = "box" if low.dtype.kind == "f" else "integers"
-        case Discrete(n=n, start=low):
-            high = low + n - 1
-        case MultiDiscrete(nvec=n, start=low):
-            high = low + (n - 1)
-        case MultiBinary(shape=shape):
-            low, high = np.zeros(shape), np.ones(shape)
-        case _:
-            raise BadEnvironmentError(
-                f"the environment has the action space {action}, allowed: Box, Discrete,"
-                " MultiDiscrete, MultiBinary; flatten it in a wrapper."
-            )
-    low, high = (tuple(map(float, np.ravel(bound))) for bound in (low, high))
-    return Spaces(obs.shape[0], kind, low, high, tuple(action.shape or ()), str(action.dtype))
 
 
 def _vector(world: World, num_envs: int, episode_length: int | None = None) -> WorldVectorEnv:

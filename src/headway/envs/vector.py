@@ -19,6 +19,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.error import NoAsyncCallError
+from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 from gymnasium.utils import seeding
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv
 from gymnasium.vector.utils import CloudpickleWrapper, batch_space
@@ -32,12 +33,13 @@ from headway.errors import (
     unknown_name,
 )
 from headway.sim_params import SimParamSets
+from headway.spaces import Spaces
 
 SimParams = dict[str, float]
 Schedule = Mapping[int, Mapping[str, float]]
 """New simulator parameters by the step before which they come into force; 0 is the first."""
 Makers = Sequence[Callable[[], gymnasium.Env]]
-Spaces = tuple[gymnasium.Space, gymnasium.Space]
+GymSpaces = tuple[gymnasium.Space, gymnasium.Space]
 """Observation and action space."""
 
 
@@ -66,12 +68,13 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         "autoreset_mode": AutoresetMode.DISABLED,
     }
 
-    def __init__(self, num_envs: int, spaces: Spaces, episode_length: int | None):
+    def __init__(self, num_envs: int, spaces: GymSpaces, episode_length: int | None):
         if num_envs < 1 or (episode_length is not None and episode_length < 1):
             raise ConfigError(
                 f"num_envs is {num_envs} and episode_length {episode_length}, allowed: at least 1."
             )
         self.num_envs, self.episode_length = num_envs, episode_length
+        self.spaces = read_spaces(*spaces)
         self.single_observation_space, self.single_action_space = spaces
         self.observation_space = batch_space(spaces[0], num_envs)
         self.action_space = batch_space(spaces[1], num_envs)
@@ -236,6 +239,36 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Return all observations, in an array of their own."""
 
 
+def read_spaces(obs: gymnasium.Space, action: gymnasium.Space) -> Spaces:
+    """Sizes, bounds and kind of an observation and an action space.
+
+    Raises:
+        BadEnvironmentError: Observations are no row of numbers, or actions of another kind.
+    """
+    if len(obs.shape or ()) != 1:
+        raise BadEnvironmentError(
+            f"the environment has the observation space {obs}, allowed: numbers in one row; wrap"
+            " it in gymnasium.wrappers.FlattenObservation where it is made."
+        )
+    kind: Any = "categories"
+    match action:
+        case Box(low=low, high=high):
+            kind = "box" if low.dtype.kind == "f" else "integers"
+        case Discrete(n=n, start=low):
+            high = low + n - 1
+        case MultiDiscrete(nvec=n, start=low):
+            high = low + (n - 1)
+        case MultiBinary(shape=shape):
+            low, high = np.zeros(shape), np.ones(shape)
+        case _:
+            raise BadEnvironmentError(
+                f"the environment has the action space {action}, allowed: Box, Discrete,"
+                " MultiDiscrete, MultiBinary; wrap it in gymnasium.wrappers.TransformAction."
+            )
+    low, high = (tuple(map(float, np.ravel(bound))) for bound in (low, high))
+    return Spaces(obs.shape[0], kind, low, high, tuple(action.shape or ()), str(action.dtype))
+
+
 class SequentialVectorEnv(HeadwayVectorEnv):
     """Any Gymnasium environments, stepped one after the other.
 
@@ -290,7 +323,7 @@ class SequentialVectorEnv(HeadwayVectorEnv):
     def _make_all(self, env_fns: Makers) -> Iterable[Any]:
         return (gymnasium.Wrapper(make()) for make in env_fns)  # which refuses what is no Env
 
-    def _spaces(self, env: Any) -> Spaces:
+    def _spaces(self, env: Any) -> GymSpaces:
         return env.observation_space, env.action_space
 
     def _call(self, method: str, calls: Mapping[int, tuple[Any, ...]]) -> dict[int, Any]:
@@ -337,15 +370,8 @@ class SequentialVectorEnv(HeadwayVectorEnv):
                     " the environment."
                 ) from None
 
-    def _check_spaces(self, spaces: Spaces) -> None:
+    def _check_spaces(self, spaces: GymSpaces) -> None:
         allowed = self.single_observation_space, self.single_action_space
-        for space in spaces:
-            if space.shape is None:
-                raise BadEnvironmentError(
-                    f"an environment has the space {shown(space)}, allowed: one array; where it is"
-                    " made, wrap it with gymnasium.wrappers.FlattenObservation (or, for actions,"
-                    " TransformAction)."
-                )
         if spaces != allowed:
             raise BadEnvironmentError(
                 f"an environment has the observation and action space {spaces}, allowed:"
@@ -459,7 +485,7 @@ class ProcessVectorEnv(SequentialVectorEnv):
         begun.sort(key=lambda one: one.exception() is not None)  # first those that could be made
         return (one.result() for one in begun)
 
-    def _spaces(self, env: Any) -> Spaces:
+    def _spaces(self, env: Any) -> GymSpaces:
         return env.single_observation_space, env.single_action_space
 
     def _make_one(self, i: int) -> AsyncVectorEnv:

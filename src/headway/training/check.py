@@ -107,12 +107,9 @@ def _finding(name: str, fault: str) -> Finding:
 
 def _bounds(environments: Environments) -> str:
     """Say how bounds that the Task states differ from the environment's, if they do."""
-    from headway.envs import read_spaces  # a controller is loaded without it
-
-    task, vector = environments.task, environments.vector
+    task, spaces = environments.task, environments.vector.spaces
     mine = np.array([task.action_low, task.action_high])
-    space = read_spaces(vector.single_observation_space, vector.single_action_space)
-    theirs = np.array([space.action_low, space.action_high])
+    theirs = np.array([spaces.action_low, spaces.action_high])
     if np.isclose(mine, np.where(np.isfinite(theirs), theirs, mine), rtol=1e-6).all():
         return ""
     text = f"action_low is {task.action_low} and action_high {task.action_high}, allowed: the"

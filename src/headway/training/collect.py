@@ -31,7 +31,7 @@ from headway.training.files import Arrays
 from headway.training.run import Partial, trajectories_from, trajectory_arrays
 
 if TYPE_CHECKING:
-    from gymnasium.vector import VectorEnv
+    from headway.envs import HeadwayVectorEnv
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Environments:
     name: str
     """Short name of the environment."""
     task: Task
-    vector: "VectorEnv"
+    vector: "HeadwayVectorEnv"
     sim_params: SimParamSets
     episode_length: int
 
@@ -76,8 +76,7 @@ class Environments:
                 render_mode="rgb_array" if film else None,
             )
         try:
-            read = envs.read_spaces(vector.single_observation_space, vector.single_action_space)
-            task = _task_in(config, read)
+            task = _task_in(config, vector.spaces)
         except Exception:
             vector.close()
             raise
