@@ -136,8 +136,8 @@ class Drawn(Drift):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
-    def __init__(self, how="", render_mode=None):
-        super().__init__(how)
+    def __init__(self, how="", at=3, render_mode=None):
+        super().__init__(how, at)
         self.render_mode = render_mode
 
     def render(self):

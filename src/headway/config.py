@@ -620,12 +620,14 @@ def tolerating_as(config: Config, other: Config) -> Config:
     return dataclasses.replace(found, spaces=other.spaces) if unknown else found
 
 
-def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the values of nested tables by dotted name."""
+def flatten(
+    values: Mapping[str, Any], prefix: str = "", whole: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """Return the values of nested tables by dotted name; some tables stay whole."""
     flat = {}
     for name, value in values.items():
-        if isinstance(value, Mapping) and value:
-            flat |= flatten(value, f"{prefix}{name}.")
+        if isinstance(value, Mapping) and value and name not in whole:
+            flat |= flatten(value, f"{prefix}{name}.", whole)
         else:
             flat[prefix + name] = list(value) if isinstance(value, tuple) else value
     return flat

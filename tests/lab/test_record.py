@@ -1,5 +1,6 @@
 """Films: the picture, the physics in force and the heads that planned, step by step."""
 
+import functools
 import io
 from types import SimpleNamespace
 
@@ -174,6 +175,7 @@ def test_a_film_shows_the_environment_with_its_wrappers(own, tmp_path, processes
     [
         (misbehaving.Drift, "", "drift", "TypeError at creation with render_mode, to be filmed"),
         (misbehaving.wrapped, "give_up", "drift", "at step 3: .*the robot fell apart"),
+        (functools.partial(misbehaving.wrapped, at=0), "give_up", "drift", "at reset: .*apart"),
         (misbehaving.wrapped, "", "drif", "Did you mean 'drift'"),
     ],
 )

@@ -110,21 +110,18 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
         env: Any = made.vector
         with raising(config.env, "reset"):
             obs, info = env.reset(seed=seed, options=options)
-        controller.reset({name: float(value) for name, (value,) in info["sim_params"].items()})
+            controller.reset(_physics(info))
         shown.phase("act", length)
         for step in range(1, length + 1):
             action = controller.act(obs[0])
             with raising(config.env, f"step {step}"):
                 obs, reward, terminated, truncated, info = env.step(np.asarray(action)[None])
-                if "broken" in info:
-                    raise BadEnvironmentError(f"it broke, {info['broken'][0]}")
-                (image,) = env.render()
+                physics, (image,) = _physics(info), env.render()
                 if not isinstance(image, np.ndarray) or image.ndim != 3:
                     raise BadEnvironmentError(
                         f"render() gave {type(image).__name__}, allowed: an image of shape"
                         " [height, width, 3], as with render_mode='rgb_array'."
                     )
-            physics = {name: float(value) for name, (value,) in info["sim_params"].items()}
             moments.append(Moment(image, physics, float(reward[0]), controller.heads))
             shown.advance()
             if terminated[0] or truncated[0]:
@@ -133,6 +130,13 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
     write_bytes(path, content)
     total = float(sum(moment.reward for moment in moments))
     return Recording(path, config.env, dict(moments[-1].sim_params), len(moments), total)
+
+
+def _physics(info: Mapping[str, Any]) -> dict[str, float]:
+    """The physics in force, unless the episode broke."""
+    if "broken" in info:
+        raise BadEnvironmentError(f"it broke, {info['broken'][0]}")
+    return {name: float(value) for name, (value,) in info["sim_params"].items()}
 
 
 def film(moments: Sequence[Moment], steps_per_second: float, suffix: str) -> bytes:

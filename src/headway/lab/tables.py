@@ -18,7 +18,7 @@ import pandas as pd
 from rich import box
 from rich.table import Table
 
-from headway.config import Config
+from headway.config import Config, flatten
 from headway.errors import RunError
 from headway.task import env_names, env_spec
 from headway.training.methods import METHODS
@@ -146,7 +146,7 @@ def _read_run(path: Path, notes: list[tuple[str, str]]) -> dict[str, Any] | None
     run = {"run": str(path), **_summaries("")}
     with noted("left out"):
         content = json.loads((path / "config.json").read_bytes())
-        settings = _flatten(content.get("config", content))
+        settings = flatten(content.get("config", content), whole=("sim_params", "env_options"))
         run |= {
             "env": str(settings["env"]),
             "method": str(settings["method"]),
@@ -208,15 +208,6 @@ def _summaries(metrics: str) -> dict[str, Any]:
         "curves": pd.DataFrame(curves, columns=columns),
         "collected": pd.DataFrame(collected, columns=["iteration", "group", "episode", "return"]),
     }
-
-
-def _flatten(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Settings by dotted name; physics and options of the environment stay whole."""
-    found = {}
-    for name, value in table.items():
-        nested = isinstance(value, dict) and name not in ("sim_params", "env_options")
-        found |= _flatten(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
-    return found
 
 
 def _protocol(settings: Mapping[str, Any]) -> str:

@@ -12,7 +12,6 @@ import importlib.resources
 from collections.abc import Mapping
 
 from headway.config import Config
-from headway.errors import ConfigError
 from headway.task import env_options, env_spec, episode_length
 from headway.training.run import EpisodeRow
 
@@ -61,24 +60,6 @@ def score(
         found = _REFERENCES.get((env, length, name, value))
         others_nominal = all(sim_params[other] == 1.0 for other in sim_params if other != name)
         if found and others_nominal:
-            return normalised(episode_return, *found)
+            random, ceiling = found
+            return (episode_return - random) / (ceiling - random)
     return None
-
-
-def normalised(episode_return: float, random: float, ceiling: float) -> float:
-    """Score of a return: 0 as random actions, 1 as the planner on the true dynamics.
-
-    Args:
-        episode_return: What is scored.
-        random: Mean return of random actions.
-        ceiling: Mean return of the planner on the true dynamics.
-
-    Raises:
-        ConfigError: Both references are the same, so that nothing lies between them.
-    """
-    if random == ceiling:
-        raise ConfigError(
-            f"random actions and true dynamics both return {random}, allowed: two references that"
-            " differ; report the return instead."
-        )
-    return (episode_return - random) / (ceiling - random)
