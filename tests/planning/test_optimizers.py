@@ -310,6 +310,13 @@ def test_how_bad_the_worst_candidate_is_changes_no_weight_in_mppi():
     assert worse[0, 3] > 2 * worse[0, 2] > 4 * worse[0, 1] > 8 * worse[0, 0]
 
 
+@pytest.mark.parametrize("share", [0.4, 0.7])
+def test_many_very_bad_candidates_change_no_order_in_mppi(share):
+    returns = jax.random.normal(KEY, (1, 100)).at[:, : int(100 * share)].add(-1e6)
+    weights = softmax_weights(returns, 0.5)
+    assert (weights * jnp.maximum(returns, -5)).sum() > 0.7
+
+
 @pytest.mark.parametrize(
     ("optimizer", "gap"), [(CEM(200, 8, 20), 0.05), (MPPI(200, 8), 0.15)], ids=["CEM", "MPPI"]
 )

@@ -51,13 +51,19 @@ def softmax_weights(
     """Weights that sum to 1, by the softmax of the standardised returns over a temperature.
 
     The unit is the better half's deviation from the median: the standard deviation wherever
-    returns lie symmetrically, but no bad outlier changes it.
+    returns lie symmetrically, but no bad outlier changes it. Where most candidates are so bad that
+    the median is one of them (eight times farther from the best than the upper quartile is), it is
+    the median of the others.
 
     Equal returns weigh the same; a return of -inf weighs nothing, and so do all of them where
     nothing is finite.
     """
     finite = jnp.isfinite(returns)
-    median = jnp.nanmedian(jnp.where(finite, returns, jnp.nan), axis=-1, keepdims=True)
+    known = jnp.where(finite, returns, jnp.nan)
+    median, quartile, best = jnp.nanquantile(known, jnp.array([0.5, 0.75, 1.0]), -1, keepdims=True)
+    worst = best - 8 * (best - quartile)
+    others = jnp.where(known >= worst, known, jnp.nan)
+    median = jnp.where(median < worst, jnp.nanmedian(others, -1, keepdims=True), median)
     above = returns - median
     square = jnp.mean(jnp.square(above), axis=-1, keepdims=True, where=finite & (above >= 0))
     logits = above / jnp.where(square > 0, jnp.sqrt(square), 1.0) / temperature
