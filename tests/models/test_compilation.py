@@ -1,4 +1,4 @@
-"""JAX's settings: none on import, the persistent cache when asked, no 64-bit mode."""
+"""JAX's settings: none on import, the persistent cache when asked, none that changes numbers."""
 
 import os
 import subprocess
@@ -41,7 +41,7 @@ def run(program, **variables):
 @pytest.fixture
 def jax_settings():
     """JAX's settings, to be changed until the test ends."""
-    names = (FOLDER, SECONDS, "jax_enable_compilation_cache", "jax_enable_x64")
+    names = (FOLDER, SECONDS, "jax_enable_compilation_cache", *compilation._NEEDED)
     before = {name: getattr(jax.config, name) for name in names}
     yield jax.config
     for name, value in before.items():
@@ -90,14 +90,24 @@ def test_a_cache_that_cannot_be_written_is_one_warning(tmp_path, jax_settings, r
     assert f"cannot be kept in {tmp_path}/file/cache" in str(warning.message)
 
 
-def test_64_bit_mode_is_refused_in_one_line_before_anything_is_collected(
-    tmp_path, jax_settings, monkeypatch, capsys
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("jax_enable_x64", True),
+        ("jax_numpy_rank_promotion", "raise"),
+        ("jax_numpy_dtype_promotion", "strict"),
+        ("jax_default_prng_impl", "rbg"),
+        ("jax_threefry_partitionable", False),
+    ],
+)
+def test_what_changes_numbers_is_refused_in_one_line_before_anything_is_collected(
+    name, value, tmp_path, jax_settings, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    jax_settings.update("jax_enable_x64", True)
+    jax_settings.update(name, value)
     assert main(["train", "pendulum", "--preset", "smoke", "--quiet"]) == 1
     said = capsys.readouterr().err
-    assert said.startswith("error: JAX is in 64-bit mode, allowed: 32-bit mode")
+    assert said.startswith(f"error: JAX has {name} ")
     assert said.count("\n") == 1
     assert not list(tmp_path.iterdir())
 

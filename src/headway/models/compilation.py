@@ -13,7 +13,7 @@ import jax
 import platformdirs
 
 from headway.config import Precision
-from headway.errors import ConfigError
+from headway.errors import ConfigError, shown
 
 # Found by measuring on CPUs (docs/performance.md): full-width vectors make the activations
 # faster, and YNNPACK's fusions slow float32 products down but are the only way to fast
@@ -24,6 +24,15 @@ _WANTED: Mapping[Precision, tuple[dict[str, Any], ...]] = {
     "float32": (_WIDE_VECTORS, _NO_FUSIONS),
     "bfloat16": (_WIDE_VECTORS,),
 }
+_NEEDED: Mapping[str, Any] = {
+    "jax_enable_x64": False,
+    "jax_numpy_dtype_promotion": "standard",
+    "jax_numpy_rank_promotion": "allow",
+    "jax_debug_infs": False,
+    "jax_default_prng_impl": "threefry2x32",  # decides all draws, as does the next one
+    "jax_threefry_partitionable": True,
+}
+"""Settings of JAX without which a run has other numbers, or none."""
 _JAX_KEEPS, _KEPT = 1.0, 0.05
 """Seconds that a program must take to compile to be kept: JAX's default, and ours."""
 
@@ -39,14 +48,16 @@ def prepare_jax() -> None:
     Headway changes nothing.
 
     Raises:
-        ConfigError: JAX is in 64-bit mode.
+        ConfigError: JAX is in 64-bit mode, or set to something else that changes the numbers.
     """
     settings: Any = jax.config  # JAX declares its settings while running
-    if settings.jax_enable_x64:
-        raise ConfigError(
-            "JAX is in 64-bit mode, allowed: 32-bit mode, in which the models are trained; unset"
-            " JAX_ENABLE_X64 or give a process of its own to what needs it."
-        )
+    for name, needed in _NEEDED.items():
+        got = getattr(settings, name, needed)
+        if getattr(got, "value", got) != needed:
+            raise ConfigError(
+                f"JAX has {name} {shown(got)}, allowed: {needed}, with which runs are trained;"
+                f" unset {name.upper()}, or give a process of its own to what needs it."
+            )
     if not settings.jax_enable_compilation_cache:
         return
     if settings.jax_compilation_cache_dir is None:
