@@ -1,6 +1,7 @@
 """The command line: what it passes to the library, what it prints, its exit codes."""
 
 import dataclasses
+import io
 import json
 import re
 import subprocess
@@ -113,10 +114,14 @@ def test_wrong_usage_exits_2_and_says_what_there_is(capsys, calls, words, text):
         ("train pendulum --sim-params missing.json", "missing.json"),
         ("evaluate nowhere --json", "allowed: a run directory"),
         ("plot-dynamics pendulum --num-states 0", "--num-states is 0, allowed: "),
+        (
+            "evaluate RUN --sim-params length=1 length=2",
+            "--sim-params is length=1 length=2, allowed",
+        ),
     ],
 )
-def test_errors_are_one_line_and_exit_1(capsys, calls, words, text):
-    code, out, err = run(capsys, *words.split())
+def test_errors_are_one_line_and_exit_1(capsys, calls, trained, words, text):
+    code, out, err = run(capsys, *words.replace("RUN", str(trained)).split())
     assert (code, out) == (1, "")
     assert re.fullmatch(rf"error: .*{re.escape(text)}.*\n", err)
     assert not calls
@@ -226,6 +231,13 @@ def test_list(capsys, what, names):
     assert all(name in out for name in names)
     listed = json.loads(run(capsys, "list", what, "--json")[1])[what]
     assert set(names) <= {entry["name"] for entry in listed}
+
+
+def test_what_a_terminal_cannot_show_is_escaped(monkeypatch):
+    ascii_only = io.TextIOWrapper(io.BytesIO(), "ascii")
+    monkeypatch.setattr(sys, "stdout", ascii_only)
+    assert main(["list", "methods"]) == 0
+    assert b"\\u2013" in ascii_only.buffer.getvalue()
 
 
 def test_plot_dynamics(capsys, tmp_path):

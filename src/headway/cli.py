@@ -5,6 +5,7 @@ Headway's, 2 wrong usage, 130 interrupted, 143 terminated.
 """
 
 import dataclasses
+import io
 import json
 import os
 import re
@@ -684,6 +685,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     stopped, code = "", 1
     warnings.formatwarning = lambda text, *_, **__: f"warning: {text}\n"
+    if isinstance(sys.stdout, io.TextIOWrapper):  # not every terminal or pipe takes a ✓
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         command = parse(words)
         if not isinstance(command, List):
@@ -769,6 +772,8 @@ def _json_or_text(word: str) -> Any:
 def _physics(words: Sequence[str], option: str) -> dict[str, float]:
     """Read `length=0.5` and `mass=2`; a name may hold blanks and further equals signs."""
     pairs = [word.rpartition("=") for word in words]
+    if len({name for name, *_ in pairs}) < len(pairs):
+        raise ConfigError(f"{option} is {' '.join(words)}, allowed: each name once.")
     try:
         return {name: float(value) for name, _, value in pairs}
     except ValueError as error:
