@@ -56,9 +56,9 @@ class LimitError(HeadwayError, RuntimeError):
 
 
 def shown(value: Any) -> str:
-    """A value as it stands in a message: like `repr`, but never long."""
+    """A value as it stands in a message: like `repr`, but never long, and in one line."""
     try:
-        return _SHORT.repr(value)
+        return _SHORT.repr(value).replace("\n", " ")
     except ValueError:  # Python refuses to write out whole numbers of thousands of digits
         return "a number of thousands of digits"
 

@@ -185,17 +185,17 @@ def _checked(where: str, values: Any) -> Values:
         )
     checked = {}
     for name, given in values.items():
-        column = given.tolist() if isinstance(given, np.ndarray) else given
+        column = given.tolist() if hasattr(given, "tolist") else given  # also pandas, JAX
         if isinstance(column, Mapping) and set(column) == {"low", "high"}:
             column = Uniform(**column)
         if isinstance(column, Uniform):
             checked[name] = column
             continue
-        listed = isinstance(column, list | tuple | range) and column
+        listed = isinstance(column, list | tuple | range) and column and isinstance(name, str)
         if not listed or not all(map(_is_finite, column)):
             raise ConfigError(
-                f"sim_params {where}, {str(name)[:80]}, is {shown(column)}, allowed: one or more"
-                " finite numbers, or a range {'low': number, 'high': number}."
+                f"sim_params {where}, {str(name)[:80]}, is {shown(column)}, allowed: for a name one"
+                " or more finite numbers, or a range {'low': number, 'high': number}."
             )
         checked[name] = tuple(map(float, column))
     if math.prod(len(_column(column)) for column in checked.values()) > MAX_COMBINATIONS:

@@ -1,6 +1,8 @@
 import json
 
+import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 
 from headway.errors import ConfigError, UnknownNameError
@@ -29,7 +31,8 @@ def test_values_may_be_lists_and_numpys_arrays_and_numbers():
     sets = SimParamSets(train, {"low": {"mass": [0.1, 0.2], "length": (np.float64(0.5),)}})
     assert sets == SETS
     assert {type(value) for group in sets.group("train") for value in group.values()} == {float}
-    assert SimParamSets({"leg": range(3)}).train == {"leg": (0.0, 1.0, 2.0)}
+    for leg in (range(3), jnp.arange(3), pd.Series([0, 1, 2])):
+        assert SimParamSets({"leg": leg}).train == {"leg": (0.0, 1.0, 2.0)}
 
 
 def test_ranges_are_drawn_from_evenly_and_tested_evenly():
@@ -57,6 +60,7 @@ def test_ranges_are_drawn_from_evenly_and_tested_evenly():
         {"train": {"mass": [float("nan")]}},
         {"train": {"mass": ["1"]}},
         {"train": {"mass": [True]}},
+        {"train": {0: [1.0]}},
         {"train": {"mass": np.ones((2, 2))}},
         {"train": {"mass": range(0)}},
         {"train": {"mass": {"low": 1.0}}},
