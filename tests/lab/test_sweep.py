@@ -40,13 +40,15 @@ def test_what_a_run_only_tolerates_does_not_separate_runs(tmp_path):
     assert same.state.name == "done"
 
 
-def test_another_run_in_the_directory_is_refused(tmp_path):
+def test_another_run_in_the_directory_is_refused(tmp_path, monkeypatch):
     job = random_job(tmp_path, **{"planner.horizon": 3})
     write_level(job.path, random_job(tmp_path, **{"planner.horizon": 2}).config)
     assert job.state.name == "failed"
     assert "other settings (planner.horizon: 2 -> 3)" in job.state.note
     write_level(tmp_path / "again", job.config)
     assert Job(job.config, tmp_path / "again").state == State("done", 1)
+    monkeypatch.setattr(RunDir, "environment_changes", lambda run: ["task.goal: 0 -> 1"])
+    assert "task.goal" in Job(job.config, tmp_path / "again").state.note
 
 
 def test_settings_of_an_arm_win_over_those_of_the_comparison(tmp_path):

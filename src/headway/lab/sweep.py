@@ -90,6 +90,8 @@ class Job:
                     f"{self.path} holds a run with other settings ({'; '.join(found)}), perhaps of"
                     " an older version; choose another --out, or move it away."
                 )
+            if self.config.collection.check:
+                run.refuse_changed()
             finished = len(run.metrics())
         except (HeadwayError, OSError) as error:
             return State("failed", 0, reason(error))
