@@ -153,6 +153,13 @@ def test_other_settings_are_refused_with_the_difference(root):
         train_run(runs.tiny_config(**{"planner.horizon": 5}), root)
 
 
+def test_settings_that_were_edited_are_refused_though_the_run_becomes_longer(root):
+    path = root / "config.json"
+    path.write_text(path.read_text().replace('"horizon": 3', '"horizon": 5'))
+    longer = {"planner.horizon": 5, "collection.num_iterations": 9}
+    assert "config.json is damaged" in refused(train_run, runs.tiny_config(**longer), root)
+
+
 def test_what_is_no_run_is_left_alone(tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
     with pytest.raises(RunError, match="holds no run"):

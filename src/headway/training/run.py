@@ -487,7 +487,10 @@ class RunDir:
         values["config"]["collection"]["num_iterations"] = num_iterations
         content = json.dumps(values, indent=2).encode()
         for iteration in self._numbers("checksums"):  # first, since `begin` looks at the settings
-            checksums = self._checksums(iteration) | {"config.json": _digest(content)}
+            checksums = self._checksums(iteration)
+            if checksums["config.json"] != _digest(content):
+                self._read(["config.json"], iteration)
+            checksums["config.json"] = _digest(content)
             write_json(self.path / _name("checksums", iteration), checksums)
         write_bytes(self.path / "config.json", content)
 
