@@ -415,7 +415,8 @@ def _answer(env: gymnasium.Env, method: str, *given: Any) -> Any:
             if not (isinstance(found, tuple) and len(found) == 2):
                 raise TypeError("reset returned no (obs, info)")
             obs, info = found
-            return obs, info.get("sim_params", {}), (env.observation_space, env.action_space)
+            told = _numbers(info.get("sim_params"))
+            return obs, told, (env.observation_space, env.action_space)
         action, changed = given
         if changed:
             if not env.has_wrapper_attr("set_sim_params"):
@@ -435,6 +436,15 @@ def _answer(env: gymnasium.Env, method: str, *given: Any) -> Any:
                 " GymV21CompatibilityV0 of the package shimmy."
             ) from error
         raise
+
+
+def _numbers(told: Any) -> SimParams:
+    """What an environment told of its physics that is one number; the rest is its own business."""
+    found = {}
+    for name, value in dict(told or {}).items():
+        with contextlib.suppress(TypeError, ValueError):
+            found[name] = np.asarray(value, float).item()
+    return found
 
 
 _OF_OLD_GYM = re.compile(r"keyword argument '(seed|options)'|no \(obs, info\)|expected 5, got 4")

@@ -1,9 +1,10 @@
 """The contract between an environment and its Task, looked at within seconds."""
 
 import dataclasses
+import itertools
 import re
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from typing import Any, Literal
 
 import jax
@@ -20,6 +21,7 @@ from headway.training.methods import make_config
 
 TRANSITIONS = 200  # of one long episode, and about as many of short ones under all physics
 LONGEST = 500  # steps in which a sim_param must show
+MOST = 8  # values of a sim_param in a group that are tried
 BIG = 1000.0  # below, float32 resolves what happens in a step
 _REASONS = (
     (jax.errors.TracerBoolConversionError, "an `if`, `and` or `max` on numbers; use jnp.where"),
@@ -80,7 +82,7 @@ def refuse_faults(config: Config) -> None:
 def findings(config: Config) -> Iterator[Finding]:
     """Look at the environment of a run; nothing is stepped before the Task can be traced."""
     try:
-        environments = Environments.make(override(config, {"collection.num_episodes": 1}))
+        environments = _environments(config)
     except Exception as error:  # whatever the environment does while it is made
         text = " ".join(str(error).split())
         if not isinstance(error, HeadwayError):
@@ -99,6 +101,14 @@ def findings(config: Config) -> Iterator[Finding]:
             yield from _Trials(environments).findings(config.collection.max_bad_episodes)
         except HeadwayError as error:
             yield Finding("transitions", "fault", str(error))
+
+
+def _environments(config: Config) -> Environments:
+    """Two environments, so that what they share is noticed; or one, where no more can be made."""
+    name = "collection.num_episodes"
+    with suppress(Exception):
+        return Environments.make(override(config, {name: min(2, config.collection.num_episodes)}))
+    return Environments.make(override(config, {name: 1}))
 
 
 def _finding(name: str, fault: str) -> Finding:
@@ -180,38 +190,46 @@ class _Trials:
     told: dict[str, list[tuple[Any, Any]]] = dataclasses.field(default_factory=dict)
     """Values asked for, and what `reset` told, by name of the parameter."""
 
-    def act(self, physics: dict[str, float], steps: int, seed: int = 0) -> np.ndarray | None:
-        """Run an episode; its observations, or None if it broke."""
-        random, raw = random_policy(self.environments, np.random.default_rng(seed)), []
-
-        def policy(obs):
-            raw.append(obs[0].astype(np.float64))
-            return random(obs)
-
+    def act(self, *episodes: Episode, steps: int) -> list[np.ndarray | None]:
+        """Run episodes with equal actions, side by side; their observations, or None for broken."""
+        seen: list[np.ndarray | None] = []
         environments = dataclasses.replace(self.environments, episode_length=steps)
-        rollout = run_episodes(environments, [Episode(physics, seed)], policy)
-        self.broken += rollout.invalid.values()
-        if 0 not in rollout.episodes:
-            return None
-        for name, value in getattr(environments.vector, "told", [physics])[0].items():
-            self.told.setdefault(name, []).append((physics.get(name), value))
-        self.taken.append(rollout.episodes[0])
-        self.raw.append(np.array(raw))
-        return rollout.episodes[0].obs
+        size = environments.vector.num_envs
+        for start in range(0, len(episodes), size):
+            batch = episodes[start : start + size]
+            random, raw = random_policy(environments, np.random.default_rng(batch[0].seed)), []
+
+            def policy(obs, random=random, raw=raw):
+                raw.append(obs.astype(np.float64))
+                choice = random(obs)
+                return choice._replace(action=np.repeat(choice.action[:1], len(obs), 0))
+
+            rollout = run_episodes(environments, batch, policy)
+            self.broken += rollout.invalid.values()
+            told = getattr(environments.vector, "told", [one.sim_params for one in batch])
+            for row, episode in enumerate(batch):
+                found = rollout.episodes.get(row)
+                seen.append(found and found.obs)
+                if found:
+                    for name, value in told[row].items():
+                        self.told.setdefault(name, []).append((episode.sim_params.get(name), value))
+                    self.taken.append(found)
+                    self.raw.append(np.array(raw)[: len(found), row])
+        return seen
 
     def findings(self, max_broken: int) -> Iterator[Finding]:
         """Look at everything; so many episodes may break."""
         import gymnasium  # a controller is loaded without it
 
-        for env in getattr(self.environments.vector, "envs", ()):
+        for env in getattr(self.environments.vector, "envs", ())[:1]:
             if isinstance(env, gymnasium.Env):  # and not in a process of its own
                 yield from _wrappers(env)
         sets = self.environments.sim_params
         steps = max(10, TRANSITIONS // (2 * len(sets.group_names) * len(sets.names)))
-        first = sets.group("train")[0]
-        before = self.act(first, TRANSITIONS)
+        first, last = Episode(sets.group("train")[0], 0), Episode(sets.group("train")[-1], 1)
+        (before,) = self.act(first, steps=TRANSITIONS)
         params = [self.sim_param(name, steps) for name in sets.names]
-        after = self.act(first, steps)
+        after, *_ = self.act(first, last, steps=steps)
         same = before is None or after is None
         if not same and len(before[: steps + 1]) == len(after):
             same = np.allclose(before[: len(after)], after)
@@ -224,7 +242,7 @@ class _Trials:
             text += f" the first: {self.broken[0]}."
             yield Finding("episodes", "fault" if fault else "remark", text)
         if self.taken:
-            yield from _compared(self.environments.task, self.taken)
+            yield from compared(self.environments.task, self.taken)
             yield _finding("numbers", _unresolved(self.raw))
 
     def sim_param(self, name: str, steps: int) -> Finding:
@@ -233,22 +251,26 @@ class _Trials:
         known = {row[name] for group in sets.group_names for row in sets.group(group)}
         if len(known) == 1:
             return Finding(name, "remark", "It has one value, so nothing shows that it is applied.")
-        for start, group in enumerate(sets.group_names):
-            first, *rest = sets.group(group)
-            values = {row[name] for row in rest} - {first[name]} or known - {first[name]}
-            # The nearest value, so that a range that the environment stops at is noticed.
-            other = first | {name: min(values, key=lambda value: abs(value - first[name]))}
-            for more, length in enumerate((steps, LONGEST, LONGEST)):
-                seed = start + more * len(sets.group_names)
-                one, two = self.act(first, length, seed), self.act(other, length, seed)
-                if one is None or two is None or not np.array_equal(one, two):
-                    break
-            else:
-                text = f"It changes no observation in group {group}, be it {first[name]:g} or"
-                text += f" {other[name]:g}; see that `reset` applies options['sim_params'] by this"
-                text += " name, and that no wrapper drops the options."
-                hint = did_you_mean(name, {*self.told} - {*sets.names})
-                return Finding(name, "fault", text + hint)
+        for seed, group in enumerate(sets.group_names):
+            rows = sets.group(group)
+            values = sorted({row[name] for row in rows})
+            if len(values) == 1:  # the nearest one, so that a range that is clipped is noticed
+                others = known - {*values}
+                values.append(min(others, key=lambda value: abs(value - values[0])))
+            values = values[:: -(-len(values) // MOST)] + values[-1:] * (len(values) > MOST)
+            physics = [rows[0] | {name: value} for value in values]
+            seen = self.act(*(Episode(one, seed) for one in physics), steps=steps)
+            for two, pair in zip(*map(itertools.pairwise, (physics, seen)), strict=True):
+                if _equal(*pair) and all(
+                    _equal(*self.act(*(Episode(one, seed + more) for one in two), steps=LONGEST))
+                    for more in (1, 2)
+                ):
+                    text = f"It changes no observation in group {group}, be it {two[0][name]:g} or"
+                    text += f" {two[1][name]:g}; see that `reset` applies options['sim_params'] by"
+                    text += " this name, that no wrapper drops the options, and that environments"
+                    text += " do not share what it sets."
+                    hint = did_you_mean(name, {*self.told} - {*sets.names})
+                    return Finding(name, "fault", text + hint)
         for asked, told in self.told.get(name, ()):
             if not np.isclose(asked, told, rtol=1e-5):
                 return _finding(name, f"Asked for {asked:g}, info['sim_params'] says {told:g}.")
@@ -257,7 +279,11 @@ class _Trials:
         return _finding(name, "")
 
 
-def _compared(task: Task, taken: list[Trajectory]) -> Iterator[Finding]:
+def _equal(one: np.ndarray | None, two: np.ndarray | None) -> bool:
+    return one is not None and two is not None and np.array_equal(one, two)
+
+
+def compared(task: Task, taken: list[Trajectory]) -> Iterator[Finding]:
     """Compare the Task's numbers with the environment's."""
     ended = np.concatenate([np.arange(1, len(t) + 1) == len(t) * t.terminated for t in taken])
     rows = [(t.obs[:-1], t.action, t.obs[1:], t.reward) for t in taken]

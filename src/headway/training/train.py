@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from functools import partial
@@ -17,7 +18,7 @@ from headway.data import Trajectory
 from headway.errors import DivergenceError
 from headway.models.fitting import EpochStats
 from headway.task import BUILT_IN
-from headway.training.check import refuse_faults
+from headway.training.check import compared, refuse_faults
 from headway.training.collect import (
     Batches,
     Environments,
@@ -202,6 +203,11 @@ class _Training:
         rollout = batches.run("collect", episodes, policy)
         if not rollout.episodes:
             raise batches.too_many()
+        if self.config.collection.check and self.config.env not in BUILT_IN:
+            for found in compared(environments.task, list(rollout.episodes.values())):
+                if found.text:  # random actions did not come where it shows
+                    where = f"{self.config.env}, iteration {self.iteration}, {found.name}: "
+                    warnings.warn(where + found.text, stacklevel=1)
         return rollout
 
     def batches(self, phase: Literal["collection", "evaluation"]) -> Batches:
