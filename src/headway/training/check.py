@@ -209,7 +209,7 @@ class _Trials:
             told = getattr(environments.vector, "told", [one.sim_params for one in batch])
             for row, episode in enumerate(batch):
                 found = rollout.episodes.get(row)
-                seen.append(found and found.obs)
+                seen.append(found.obs if found else None)
                 if found:
                     for name, value in told[row].items():
                         self.told.setdefault(name, []).append((episode.sim_params.get(name), value))
@@ -230,9 +230,11 @@ class _Trials:
         (before,) = self.act(first, steps=TRANSITIONS)
         params = [self.sim_param(name, steps) for name in sets.names]
         after, *_ = self.act(first, last, steps=steps)
-        same = before is None or after is None
-        if not same and len(before[: steps + 1]) == len(after):
-            same = np.allclose(before[: len(after)], after)
+        same = True
+        if before is not None and after is not None:
+            same = len(before[: steps + 1]) == len(after) and np.allclose(
+                before[: len(after)], after
+            )
         text = "The same seed, sim_params and actions gave another episode than before; draw from"
         text += " self.np_random after super().reset(seed=seed), and let nothing stay of others."
         yield from (_finding("repeats", "" if same else text), *params)
