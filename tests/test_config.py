@@ -87,7 +87,7 @@ def test_override_replaces_the_named_settings_only():
 
 
 def test_override_takes_simulator_parameters_and_none():
-    for asked in (SETS, SETS.to_dict()):
+    for asked in (SETS, dataclasses.asdict(SETS)):
         assert override(DEFAULT, {"sim_params": asked}).sim_params == SETS
     assert override(CHANGED, {"sim_params": None}).sim_params is None
 

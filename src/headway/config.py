@@ -511,9 +511,7 @@ episodes do not depend on it, so a run may go on with other values."""
 
 def to_dict(config: Config) -> dict[str, Any]:
     """Return the settings as nested dictionaries of plain values."""
-    values = dataclasses.asdict(config)
-    values["sim_params"] = config.sim_params.to_dict() if config.sim_params else None
-    return values
+    return dataclasses.asdict(config)
 
 
 def from_dict(values: Mapping[str, Any]) -> Config:

@@ -149,13 +149,9 @@ class SimParamSets:
             raise unknown_name("group", name, self.group_names)
         return self.train if name == "train" else self.unseen[name]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain dictionaries and tuples, ready for JSON."""
-        return dataclasses.asdict(self)
-
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "SimParamSets":
-        """Rebuild what `to_dict` wrote.
+        """Rebuild what `dataclasses.asdict` took apart.
 
         Raises:
             ConfigError: A part is missing, unknown, of the wrong type, or no finite number.

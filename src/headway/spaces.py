@@ -48,7 +48,8 @@ class Spaces:
         low, high = self._ends(xp)
         if self.action_kind == "categories":
             counts = self._counts
-            taken = xp.round(action - low)[..., np.repeat(np.arange(len(counts)), counts)]
+            number = xp.round(xp.clip(action, low, high) - low)
+            taken = number[..., np.repeat(np.arange(len(counts)), counts)]
             is_taken = taken == np.concatenate([np.arange(count) for count in counts])
             return xp.where(is_taken, np.float32(1.0), np.float32(-1.0))
         return 2.0 * (action - low) / (high - low) - 1.0

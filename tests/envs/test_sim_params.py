@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import jax.numpy as jnp
@@ -23,7 +24,7 @@ def test_groups_are_all_combinations_and_samples_uniform():
     draws = [SETS.sample(rng) for _ in range(2000)]
     for physics in SETS.group("train"):
         assert 0.2 < draws.count(physics) / 2000 < 0.3
-    assert SimParamSets.from_dict(json.loads(json.dumps(SETS.to_dict()))) == SETS
+    assert SimParamSets.from_dict(json.loads(json.dumps(dataclasses.asdict(SETS)))) == SETS
 
 
 def test_values_may_be_lists_and_numpys_arrays_and_numbers():
@@ -47,7 +48,7 @@ def test_ranges_are_drawn_from_evenly_and_tested_evenly():
     assert sets.spread("low", 1) == [{"mass": 0.25, "leg": 2.0}]
     assert len(sets.group("train")) == 10
     assert sets.nearest({"mass": 0.6, "leg": 1.0}) == {"mass": 0.5, "leg": 1.0}
-    assert SimParamSets.from_dict(json.loads(json.dumps(sets.to_dict()))) == sets
+    assert SimParamSets.from_dict(json.loads(json.dumps(dataclasses.asdict(sets)))) == sets
 
 
 @pytest.mark.parametrize(

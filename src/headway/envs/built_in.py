@@ -410,7 +410,7 @@ def _maker(spec: EnvSpec) -> Callable[..., gymnasium.Env]:
 
 
 def registered(env_id: str) -> Any:
-    """What Gymnasium knows of an id, which may name a module and lack a version, as for `make`."""
+    """Gymnasium's entry of an id, which may name a module and lack a version, as for `make`."""
     module, _, env_id = env_id.rpartition(":")
     if module:
         importlib.import_module(module)

@@ -230,11 +230,9 @@ class _Trials:
         (before,) = self.act(first, steps=TRANSITIONS)
         params = [self.sim_param(name, steps) for name in sets.names]
         after, *_ = self.act(first, last, steps=steps)
-        same = True
-        if before is not None and after is not None:
-            same = len(before[: steps + 1]) == len(after) and np.allclose(
-                before[: len(after)], after
-            )
+        same = before is None or after is None
+        if before is not None and after is not None and len(before[: steps + 1]) == len(after):
+            same = np.allclose(before[: len(after)], after)
         text = "The same seed, sim_params and actions gave another episode than before; draw from"
         text += " self.np_random after super().reset(seed=seed), and let nothing stay of others."
         yield from (_finding("repeats", "" if same else text), *params)

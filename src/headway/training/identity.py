@@ -45,7 +45,7 @@ def identity(config: Config) -> dict[str, Any]:
     found = {
         "task": {"class": _name(type(task)), **fields},
         "environment": environment and _name(environment) + (_described(keywords) * bool(keywords)),
-        "sim_params": sim_param_sets(config).to_dict(),
+        "sim_params": dataclasses.asdict(sim_param_sets(config)),
         "episode_length": episode_length(config),
         "options": env_options(config),
         "source": {name: _digest(file) for name, file in sorted(_sources(modules).items())},

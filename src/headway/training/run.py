@@ -138,11 +138,6 @@ class RunDir:
         self.path = Path(path)
         self._num_checkpoints = KEPT
 
-    @property
-    def figures(self) -> Path:
-        """The folder of the figures."""
-        return self.path / "figures"
-
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
         """Keep every other process from writing here; the directory is made if need be.
