@@ -131,7 +131,8 @@ def test_an_episode_is_filmed_under_the_physics_that_were_asked_for(run_dir, tmp
         ({"output": "film.avi"}, "film.avi cannot be a film, allowed: names ending in .gif"),
         ({"num_steps": 0}, "num_steps is 0"),
         ({"sim_params": {"lenth": 1.0}}, "Did you mean 'length'"),
-        ({"schedule": {3: {"mass": -1.0}}}, "mass"),
+        ({"schedule": {1: {"mass": -1.0}}}, "mass"),
+        ({"schedule": {2: {"mass": 1.0}}}, "schedule has step 2, allowed: below 2"),
         ({"settings": {"model.num_heads": 1}}, "model.num_heads"),
     ],
 )
@@ -142,9 +143,10 @@ def test_what_cannot_be_filmed_is_refused_and_nothing_is_written(asked, reason, 
     assert not list(tmp_path.glob("*.gif"))
 
 
-def test_an_environment_that_draws_nothing_is_named(run_dir, tmp_path, monkeypatch):
-    monkeypatch.setattr(ClassicVectorEnv, "frame", lambda self, i: None)
-    with pytest.raises(BadEnvironmentError, match="gave NoneType, allowed: an image"):
+@pytest.mark.parametrize(("frame", "name"), [(None, "NoneType"), (np.ones((8, 8, 3)), "float64")])
+def test_an_environment_that_draws_no_image_is_named(frame, name, run_dir, tmp_path, monkeypatch):
+    monkeypatch.setattr(ClassicVectorEnv, "frame", lambda self, i: frame)
+    with pytest.raises(BadEnvironmentError, match=f"gave {name}, allowed: an image"):
         lab.record(run_dir, tmp_path / "film.gif", num_steps=2)
 
 

@@ -103,6 +103,8 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
     config = config_to_evaluate(run.config(), settings or {})
     controller = Controller(load_agent(run, config, iteration=iteration), seed=seed)
     length = num_steps or episode_length(config)
+    if late := [step for step in schedule or () if isinstance(step, int) and step >= length]:
+        raise ConfigError(f"schedule has step {late[0]}, allowed: below {length}, the film's end.")
     config = override(config, {"collection.episode_length": length})
     options = {"sim_params": dict(sim_params or {}), "schedule": dict(schedule or {})}
     moments: list[Moment] = []
@@ -117,16 +119,17 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
             with raising(config.env, f"step {step}"):
                 obs, reward, terminated, truncated, info = env.step(np.asarray(action)[None])
                 physics, (image,) = _physics(info), env.render()
-                if not isinstance(image, np.ndarray) or image.ndim != 3:
+                kind = getattr(image, "dtype", type(image).__name__)
+                if kind != np.uint8 or image.ndim != 3:
                     raise BadEnvironmentError(
-                        f"render() gave {type(image).__name__}, allowed: an image of shape"
+                        f"render() gave {kind}, allowed: an image of type uint8 and shape"
                         " [height, width, 3], as with render_mode='rgb_array'."
                     )
             moments.append(Moment(image, physics, float(reward[0]), controller.heads))
             shown.advance()
             if terminated[0] or truncated[0]:
                 break
-    content = film(moments, env.metadata["render_fps"], path.suffix.lower())
+    content = film(moments, env.metadata["render_fps"] or MAX_RATE, path.suffix.lower())
     write_bytes(path, content)
     total = float(sum(moment.reward for moment in moments))
     return Recording(path, config.env, dict(moments[-1].sim_params), len(moments), total)

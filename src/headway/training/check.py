@@ -209,8 +209,8 @@ class _Trials:
             told = getattr(environments.vector, "told", [one.sim_params for one in batch])
             for row, episode in enumerate(batch):
                 found = rollout.episodes.get(row)
-                seen.append(found.obs if found else None)
-                if found:
+                seen.append(None if found is None else found.obs)
+                if found is not None:
                     for name, value in told[row].items():
                         self.told.setdefault(name, []).append((episode.sim_params.get(name), value))
                     self.taken.append(found)

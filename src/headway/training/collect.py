@@ -84,7 +84,8 @@ class Environments:
 
     def close(self) -> None:
         """Free what the environments hold, and end their processes."""
-        self.vector.close()
+        with raising(self.name, "closing"):
+            self.vector.close()
 
 
 def _task_in(config: Config, read: Spaces) -> Task:
