@@ -21,7 +21,7 @@ import pandas as pd
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from headway.lab import figures
-from headway.training.references import normalised, score
+from headway.training.references import score
 from headway.training.run import parse_sim_params
 
 COLORS = (figures.FAINT, *figures.LABELS)
@@ -72,7 +72,8 @@ def scores(folder: Path, figure: Path | None, reference: Path | None) -> None:
             tests = tests.merge(earned, on=PLACE)
         keys = ["arm", "run", "physics", "sim_params"]
         means = tests.groupby(keys)[["return", "random", "true-dynamics"]].mean()
-        tests = means.apply(lambda row: normalised(*row), axis=1).rename("score").reset_index()
+        means = means.sub(means["random"], axis=0)
+        tests = (means["return"] / means["true-dynamics"]).rename("score").reset_index()
     else:
         tests["score"] = [
             score(env, parse_sim_params(physics), earned, length)
