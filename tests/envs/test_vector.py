@@ -178,8 +178,8 @@ IDS = ["own/VectorDrift", "test_vector:own/VectorDrift-v0", misbehaving.Drift]
 @pytest.mark.parametrize("timeout_s", [None, 60.0])
 @pytest.mark.parametrize("env_id", IDS)
 def test_an_environment_is_named_as_gymnasium_names_it_or_by_what_makes_it(env_id, timeout_s):
-    options = {"how": "give_up", "at": 2, "drift": None}  # of any type that JSON has
-    register(dataclasses.replace(DRIFT, name="named", env_id=env_id))
+    own, options = {"how": "give_up"}, {"at": 2, "drift": None}  # of any type that JSON has
+    register(dataclasses.replace(DRIFT, name="named", env_id=env_id, options=own))
     vector = envs.make_vec("named", 1, options=options, step_timeout_s=timeout_s)
     vector.reset(seed=0)
     actions = np.ones((1, 1), np.float32)

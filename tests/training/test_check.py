@@ -141,10 +141,11 @@ def random_run(path, **settings):
     return headway.train("cart", method="random", preset="smoke", run_dir=path, settings=settings)
 
 
-def test_a_fault_stops_before_anything_is_written(cart, tmp_path):
-    cart(changed(reward=lambda self, o, a, n: n[..., 0]), lies=1.0)
+@pytest.mark.parametrize("processes", [True, False])
+def test_a_fault_stops_before_anything_is_written(processes, cart, tmp_path):
+    cart(changed(reward=lambda self, o, a, n: n[..., 0]), entry="test_check:Cart", lies=1.0)
     with pytest.raises(BadEnvironmentError, match=r"cart and its Task, mass: .* 1 more\. `headway"):
-        random_run(tmp_path / "run")
+        random_run(tmp_path / "run", **{"collection.env_processes": processes})
     assert not (tmp_path / "run").exists()
     random_run(tmp_path / "run", **{"collection.check": False})
     assert (tmp_path / "run").exists()
@@ -154,13 +155,6 @@ def test_what_a_lost_episode_told_is_not_compared(cart):
     found = headway.check(cart(lost=3.0))  # the heavy ones
     assert [row.name for row in found if row.status == "remark"] == ["schedule", "episodes"]
     assert not [row for row in found if row.status == "fault"]
-
-
-def test_faults_in_a_process_are_named(cart, tmp_path):
-    settings = {"collection.env_processes": True}
-    cart(entry="test_check:Cart", lies=1.0)
-    with pytest.raises(BadEnvironmentError, match="mass: Asked for"):
-        random_run(tmp_path / "run", **settings)
 
 
 class GoalTask(CartTask):

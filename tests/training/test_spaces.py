@@ -107,6 +107,7 @@ def test_every_optimizer_plans_the_best_category(optimizer):
     np.testing.assert_array_equal(decision.action, [[-1.0, 1.0, -1.0]])
 
 
+@pytest.mark.filterwarnings("ignore:.*was trained on push as it was before")
 @pytest.mark.parametrize(
     ("name", "method"),
     [*zip(SPACES, ["tmcl", "random", "rebal", "grbal", "pets"], strict=True)],

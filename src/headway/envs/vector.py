@@ -283,8 +283,8 @@ class SequentialVectorEnv(HeadwayVectorEnv):
 
     Raises:
         ConfigError: There are none.
-        BadEnvironmentError: Their spaces differ or are no arrays, or one cannot be made after
-            others were. None stays open.
+        BadEnvironmentError: Their spaces differ or are refused (`read_spaces`), or one cannot be
+            made after others were. None stays open.
     """
 
     def __init__(
