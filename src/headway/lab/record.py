@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -160,7 +161,11 @@ def film(moments: Sequence[Moment], steps_per_second: float, suffix: str) -> byt
     if suffix == ".mp4":
         images = [np.asarray(frame) for frame in frames + frames[-1:] * round(LAST_FRAME * rate)]
         look: dict[str, Any] = {"codec": "libx264", "macro_block_size": 2, "quality": 7}
-        return iio.imwrite("<bytes>", images, extension=".mp4", plugin="FFMPEG", fps=rate, **look)
+        with warnings.catch_warnings():  # JAX's, of a fork that at once becomes ffmpeg
+            warnings.simplefilter("ignore", RuntimeWarning)
+            return iio.imwrite(
+                "<bytes>", images, extension=".mp4", plugin="FFMPEG", fps=rate, **look
+            )
     # One palette for all frames, so that still parts do not flicker.
     sample = Image.new("RGB", (WIDTH, 3 * frames[0].height + len(HEADS)))
     for place, frame in enumerate((frames[0], frames[len(frames) // 2], frames[-1])):

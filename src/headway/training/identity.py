@@ -64,7 +64,8 @@ def _sources(modules: list[str]) -> dict[str, Path]:
         # A script also imports what it trains with.
         if module != "__main__" and file.suffix == ".py":
             package = getattr(sys.modules.get(module), "__package__", None)
-            modules += [name for name in _imported(file, package or "") if name in sys.modules]
+            with suppress(SyntaxError):  # it was edited since it was imported
+                modules += [name for name in _imported(file, package or "") if name in sys.modules]
     return found
 
 
