@@ -180,8 +180,8 @@ class RunDir:
         What does not change its numbers may differ (`config.TOLERANCE`), and it may become longer.
 
         Raises:
-            RunError: The directory holds a run with other settings or of an environment that was
-                changed since, or a damaged one; the message says how to go back.
+            RunError: The directory holds a run with other settings, or a damaged one; the
+                message says how to go back.
         """
         if self._is_new():
             versions = {name: importlib.metadata.version(name) for name in VERSIONED}
@@ -203,8 +203,6 @@ class RunDir:
                 f"{self.path} holds a run with other settings ({'; '.join(found)}); choose another"
                 " --run-dir, or the same settings to resume, perhaps with more iterations."
             )
-        if config.collection.check:
-            self.refuse_changed()
         if longer:
             self._lengthen(wanted)
         self.check()

@@ -289,10 +289,8 @@ class _Training:
         groups = self.groups()
         if not groups:
             return Tests()
-        agent, begin = (
-            self.trainer.agent(self.state, self.data),
-            partial(self.begin_phase, "evaluate"),
-        )
+        agent = self.trainer.agent(self.state, self.data)
+        begin = partial(self.begin_phase, "evaluate")
         return run_tests(agent, groups, groups, self.batches("evaluation"), key, begin)
 
 
