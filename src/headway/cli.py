@@ -32,7 +32,7 @@ from headway.config import (
     override,
     to_dict,
 )
-from headway.errors import ConfigError, HeadwayError
+from headway.errors import ConfigError, HeadwayError, one_line
 
 MAX_SEEDS = 1000
 PIPE_WIDTH = 130
@@ -697,7 +697,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return code
     except HeadwayError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"error: {one_line(error)}", file=sys.stderr)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:

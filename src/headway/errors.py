@@ -55,6 +55,11 @@ class LimitError(HeadwayError, RuntimeError):
     """The machine lacks the disk that a run needs."""
 
 
+def one_line(text: object, longest: int | None = None) -> str:
+    """A text, such as that of an error, in one line, cut after so many letters."""
+    return " ".join(str(text).split())[:longest]
+
+
 def shown(value: Any) -> str:
     """A value as it stands in a message: like `repr`, but never long, and in one line."""
     try:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from headway.errors import ConfigError, shown, unknown_name
+from headway.errors import ConfigError, one_line, shown, unknown_name
 from headway.sim_params import SimParamSets
 from headway.spaces import Spaces
 
@@ -265,10 +265,10 @@ def _imported(path: str) -> EnvSpec:
     try:
         module = importlib.import_module(module_name)
     except Exception as error:  # whatever the module does while it is imported
-        reason = " ".join(str(error).split())[:300]
         raise ConfigError(
             f"environment {path!r}: importing {module_name!r} raised {type(error).__name__}"
-            f" ({reason}), allowed: module:name of a module that Python finds from here."
+            f" ({one_line(error, 300)}), allowed: module:name of a module that Python finds from"
+            " here."
         ) from error
     if not hasattr(module, name):
         known = [key for key, value in vars(module).items() if isinstance(value, EnvSpec)]

@@ -29,6 +29,7 @@ from headway.errors import (
     BrokenEpisodeError,
     ConfigError,
     HeadwayError,
+    one_line,
     shown,
     unknown_name,
 )
@@ -307,10 +308,9 @@ class SequentialVectorEnv(HeadwayVectorEnv):
         except Exception as error:
             self.close_extras()
             if 0 < len(self.envs) < len(env_fns):
-                reason = " ".join(str(error).split())[:300]
                 raise BadEnvironmentError(
                     f"environment {len(self.envs) + 1} of {len(env_fns)} could not be made"
-                    f" ({type(error).__name__}: {reason}); if only one can exist, set"
+                    f" ({type(error).__name__}: {one_line(error, 300)}); if only one can exist, set"
                     " collection.num_episodes to 1."
                 ) from error
             raise
@@ -563,8 +563,7 @@ class _Answering(gymnasium.Wrapper):
         except HeadwayError as error:
             return type(error)(str(error))
         except Exception as error:  # of a class that the parent may not know
-            reason = " ".join(str(error).split())
-            return BadEnvironmentError(f"raised {type(error).__name__}: {reason}")
+            return BadEnvironmentError(f"raised {type(error).__name__}: {one_line(error)}")
 
 
 def _kill(envs: dict[int, Any]) -> None:

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 from headway.config import Config, differences, flatten, from_dict, to_dict, tolerating_as
-from headway.errors import BusyError, ConfigError, HeadwayError, RunError
+from headway.errors import BusyError, ConfigError, HeadwayError, RunError, one_line
 from headway.lab.paper import Experiment, Settings
 from headway.task import env_spec
 from headway.training.files import reading
@@ -295,8 +295,8 @@ def make_run(config: str, path: str, quiet: bool = True) -> tuple[str, str]:
 
 def reason(error: BaseException) -> str:
     """Word in one line why a run failed."""
-    text = " ".join(str(error).split())
-    return text if isinstance(error, HeadwayError) else f"{type(error).__name__}: {text[:500]}"
+    own = isinstance(error, HeadwayError)
+    return one_line(error) if own else f"{type(error).__name__}: {one_line(error, 500)}"
 
 
 # Begins a task; waits for a while and yields tasks that ended, with `done`, `failed`, `busy` or

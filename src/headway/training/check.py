@@ -13,7 +13,7 @@ import numpy as np
 
 from headway.config import Config, override
 from headway.data import Trajectory
-from headway.errors import BadEnvironmentError, HeadwayError, did_you_mean
+from headway.errors import BadEnvironmentError, HeadwayError, did_you_mean, one_line
 from headway.models.compilation import prepare_jax
 from headway.task import EnvSpec, Task, register
 from headway.training.collect import Environments, Episode, random_policy, run_episodes
@@ -84,7 +84,7 @@ def findings(config: Config) -> Iterator[Finding]:
     try:
         environments = _environments(config)
     except Exception as error:  # whatever the environment does while it is made
-        text = " ".join(str(error).split())
+        text = one_line(error)
         if not isinstance(error, HeadwayError):
             text = f"Making it raised {type(error).__name__}: {text}"
         yield Finding("environment", "fault", text)
@@ -160,7 +160,7 @@ def _traced(task: Task, name: str, shape: tuple[int, ...] | None, rows: list[Any
     try:
         single, batch = jax.jit(both)(*rows)
     except Exception as error:  # whatever the method does
-        text = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        text = f"{type(error).__name__}: {one_line(error, 200)}"
         text = next((words for kind, words in _REASONS if isinstance(error, kind)), text)
         return f"JAX cannot trace it with leading axes: {text}."
     got = single.shape[1:]

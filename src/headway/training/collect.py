@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, PRNGKeyArray
 
 from headway.config import LARGEST, Config, differences
 from headway.data import Trajectory
-from headway.errors import BadEnvironmentError, HeadwayError, shown
+from headway.errors import BadEnvironmentError, HeadwayError, one_line, shown
 from headway.planning.agent import Agent
 from headway.sim_params import SimParamSets
 from headway.spaces import Spaces
@@ -312,10 +312,9 @@ def raising(name: str, when: str) -> Iterator[None]:
     except HeadwayError:
         raise
     except Exception as error:
-        reason = " ".join(str(error).split())[:300]
         raise BadEnvironmentError(
-            f"{name} raised {type(error).__name__} at {when}: {reason}; correct the environment,"
-            " then the same command goes on."
+            f"{name} raised {type(error).__name__} at {when}: {one_line(error, 300)}; correct the"
+            " environment, then the same command goes on."
         ) from error
 
 
@@ -347,7 +346,7 @@ class _ValidityFilter:
         """Note the episodes of which the environments themselves say that they broke."""
         for row, reason in info.get("broken", {}).items():
             where = f"{self._name} broke at step {step} under {self._physics[row]}"
-            self._note(row, f"{where}: {' '.join(reason.split())[:300]}")
+            self._note(row, f"{where}: {one_line(reason, 300)}")
 
     def finite(self, values: Any, what: str, step: int, instead: np.ndarray) -> np.ndarray:
         """Replace what is not finite by `instead`, and note those episodes.

@@ -14,7 +14,7 @@ import numpy as np
 import safetensors.numpy
 from safetensors import SafetensorError, safe_open
 
-from headway.errors import HeadwayError, LimitError, RunError
+from headway.errors import HeadwayError, LimitError, RunError, one_line
 
 Tree = TypeVar("Tree")
 Arrays = dict[str, np.ndarray]
@@ -168,5 +168,4 @@ def reading(path: Path) -> Iterator[None]:
     except OSError as error:
         raise RunError(f"{path} cannot be read: {error.strerror}; check the path.") from None
     except (SafetensorError, HeadwayError, ValueError, KeyError, TypeError) as error:
-        reason = " ".join(str(error).split())[:300]
-        raise RunError(f"{path} is damaged: {reason}.") from None
+        raise RunError(f"{path} is damaged: {one_line(error, 300)}.") from None
