@@ -161,7 +161,7 @@ class EnvSpec:
     episode_length: int
     """Steps after which an episode is cut."""
     default_sim_params: Mapping[str, float]
-    """The physics of the unchanged environment."""
+    """The physics of the unchanged environment, also parameters that `sim_params` leaves alone."""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Options of the environment, with their defaults; anything that JSON holds."""
     description: str = ""
@@ -175,12 +175,12 @@ class EnvSpec:
     """Entries of an observation with their units, for figures; unnamed ones are numbered."""
 
     def __post_init__(self) -> None:
-        known = set(self.default_sim_params) == set(self.sim_params.names)
+        known = set(self.default_sim_params) >= set(self.sim_params.names)
         if not (self.name and self.episode_length >= 1 and self.epochs >= 1 and known):
             raise ConfigError(
                 f"environment {self.name!r} has episode_length {self.episode_length}, epochs"
                 f" {self.epochs} and default_sim_params for {sorted(self.default_sim_params)},"
-                f" allowed: a name, at least 1 each, and its sim_params,"
+                " allowed: a name, at least 1 each, and also its sim_params,"
                 f" {sorted(self.sim_params.names)}."
             )
         try:

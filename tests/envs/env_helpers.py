@@ -34,9 +34,11 @@ def record(env, actions, **reset):
 
 
 def all_physics(name: str) -> list[dict[str, float]]:
-    """Every training and unseen physics of an environment."""
-    sets = env_spec(name).sim_params
-    return [values for group in sets.group_names for values in sets.group(group)]
+    """Every training and unseen physics of an environment, in full; also with a gain."""
+    sets, default = env_spec(name).sim_params, env_spec(name).default_sim_params
+    gains = [{}, {"gain": -0.7}] if "gain" in default else [{}]
+    rows = [values for group in sets.group_names for values in sets.group(group)]
+    return [{**default, **values, **gain} for gain in gains for values in rows]
 
 
 def distinct_physics(name: str, number: int) -> dict[str, np.ndarray]:

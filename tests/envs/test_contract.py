@@ -46,7 +46,8 @@ def test_spaces_and_names(name, env):
 
 
 def test_sim_params_are_drawn_from_the_training_values(env, name):
-    allowed = env_spec(name).sim_params.group("train")
+    spec = env_spec(name)
+    allowed = [{**spec.default_sim_params, **row} for row in spec.sim_params.group("train")]
     drawn = [env.reset(seed=seed)[1]["sim_params"] for seed in range(60)]
     assert all(values in drawn for values in allowed)
     assert all(values in allowed for values in drawn)
@@ -108,6 +109,22 @@ def test_bad_values_are_refused(env, name):
         with pytest.raises(ConfigError, match="allowed") as caught:
             env.reset(options={"sim_params": {key: bad}})
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["pendulum", "cartpole-swingup"])
+def test_a_gain_of_any_sign_is_drawn_alone_and_turns_the_action(name):
+    env = envs.make(name, sim_params=SimParamSets({"gain": (-1, 0)}))
+    default = dict(env_spec(name).default_sim_params)
+    drawn = [env.reset(seed=seed)[1]["sim_params"] for seed in range(20)]
+    assert {row["gain"] for row in drawn} == {-1.0, 0.0}
+    assert all(row | {"gain": 1.0} == default for row in drawn)
+    actions = actions_of(name, "random", 30)
+    for gain, same in ((-1.0, -actions), (0.0, 0 * actions), (0.5, actions / 2)):
+        asked = {"seed": 1, "options": {"sim_params": {"gain": gain}}}
+        wanted = record(env, same, seed=1, options={"sim_params": {"gain": 1.0}})[0]
+        np.testing.assert_allclose(record(env, actions, **asked)[0], wanted, rtol=1e-5, atol=1e-5)
+    with pytest.raises(ConfigError, match=r"gain is nan, allowed: finite numbers\.$"):
+        env.reset(options={"sim_params": {"gain": np.nan}})
 
 
 def test_unknown_names_are_refused_with_a_hint(env, name):

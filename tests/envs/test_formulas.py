@@ -20,36 +20,45 @@ def stepped(env, state, action, **sim_params):
 
 
 @pytest.mark.parametrize(
-    ("start", "torque", "length", "mass", "spin", "wrapped"),
+    ("start", "torque", "length", "mass", "gain", "spin", "wrapped"),
     [
         # 1.5 g/l sin θ + 3 u/(m l²) = 30 sin 0.3 + 18 = 26.86560619984019
-        ([0.3, -1.0], 1.5, 0.5, 1.0, -1.0 + 0.05 * 26.86560619984019, 0.3),
+        ([0.3, -1.0], 1.5, 0.5, 1.0, 1.0, -1.0 + 0.05 * 26.86560619984019, 0.3),
         # 3 u/(m l²) dt = 6 / 0.0625 · 0.05 = 4.8; the angle moves before the speed is clipped
-        ([0.0, 7.9], 2.0, 0.25, 1.0, 12.7, 0.0),
-        ([0.0, 0.0], 1.0, 1.0, 1.0, 0.15, 0.0),
-        ([0.0, 0.0], 1.0, 1.0, 2.0, 0.075, 0.0),  # mass divides the torque only
-        ([2 * np.pi + 0.1, 0.0], 0.0, 1.0, 1.0, 0.75 * np.sin(0.1), 0.1),  # reward wraps angles
+        ([0.0, 7.9], 2.0, 0.25, 1.0, 1.0, 12.7, 0.0),
+        ([0.0, 0.0], 1.0, 1.0, 1.0, 1.0, 0.15, 0.0),
+        ([0.0, 0.0], 2.0, 1.0, 1.0, -1.3, -0.39, 0.0),  # beyond the bounds; what was asked costs
+        ([0.0, 0.0], 1.0, 1.0, 2.0, 1.0, 0.075, 0.0),  # mass divides the torque only
+        (
+            [2 * np.pi + 0.1, 0.0],
+            0.0,
+            1.0,
+            1.0,
+            1.0,
+            0.75 * np.sin(0.1),
+            0.1,
+        ),  # reward wraps angles
     ],
 )
-def test_pendulum_step(start, torque, length, mass, spin, wrapped):
+def test_pendulum_step(start, torque, length, mass, gain, spin, wrapped):
     env = envs.make("pendulum")
-    state, obs, reward = stepped(env, start, [torque], length=length, mass=mass)
+    state, obs, reward = stepped(env, start, [torque], length=length, mass=mass, gain=gain)
     np.testing.assert_allclose(state, [start[0] + 0.05 * spin, min(spin, 8.0)], rtol=1e-12)
     np.testing.assert_allclose(obs, [np.cos(state[0]), np.sin(state[0]), state[1]], rtol=1e-6)
     cost = wrapped**2 + 0.1 * start[1] ** 2 + 0.001 * torque**2
     assert reward == pytest.approx(-cost, rel=1e-9)
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.25, 3.0])
-def test_cartpole_step(scale):
+@pytest.mark.parametrize(("scale", "gain"), [(1.0, 1.0), (0.25, 1.0), (3.0, -1.3)])
+def test_cartpole_step(scale, gain):
     env = envs.make("cartpole-swingup")
     x, v, angle, spin, action = 0.1, 0.5, 2.5, -1.5, 0.7
-    state, obs, reward = stepped(env, [x, v, angle, spin], [action], mass_scale=scale)
+    state, obs, reward = stepped(env, [x, v, angle, spin], [action], mass_scale=scale, gain=gain)
     # Newton's equations of cart and uniform rod, solved instead of written out:
     # M ẍ - (m l/2) cos θ θ̈ + ... with the rod's inertia m l²/3 about its end.
     # `θ` of the source grows towards negative x when its sine enters as below.
     m, length, g = 0.5 * scale, 0.6, 9.82
-    arm, force = 0.5 * m * length, 10 * np.float32(action) - 0.1 * v
+    arm, force = 0.5 * m * length, 10 * gain * np.float32(action) - 0.1 * v
     lhs = [[2 * m, -arm * np.cos(angle)], [-arm * np.cos(angle), m * length**2 / 3]]
     rhs = [force - arm * spin**2 * np.sin(angle), arm * g * np.sin(angle)]
     x_dd, angle_dd = np.linalg.solve(lhs, rhs)

@@ -9,6 +9,7 @@ from env_helpers import NAMES, ROBOTS, actions_of
 
 from headway import envs
 from headway.errors import BadEnvironmentError
+from headway.task import env_spec
 from headway.worlds import rendering
 
 HAS_OPENGL = any(ctypes.util.find_library(name) for name in ("EGL", "OSMesa"))
@@ -29,6 +30,13 @@ def test_frames_show_the_state_and_change_nothing(name):
     assert np.abs(env.render().astype(int) - first).max() > 50  # and it moved
     assert plain.unwrapped.render() is None
     env.close()
+
+
+@pytest.mark.parametrize("name", rendering.DRAWINGS)
+def test_drawings_show_what_acts_not_what_was_asked_for(name):
+    draw, physics = rendering.DRAWINGS[name], dict(env_spec(name).default_sim_params)
+    state, turned = np.array([0.5, 0.0, 3.0, 0.0]), physics | {"gain": -1.0}
+    np.testing.assert_array_equal(draw(state, 0.8, turned), draw(state, -0.8, physics))
 
 
 @needs_opengl

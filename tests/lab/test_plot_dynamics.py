@@ -15,7 +15,8 @@ def test_the_views_are_the_numbers_that_tell_physics_apart():
 
 def test_only_the_physics_differ_between_the_changes():
     spec = env_spec("pendulum")
-    physics = [dict(spec.default_sim_params), *spec.sim_params.group("train")]
+    default = dict(spec.default_sim_params)
+    physics = [default, *({**default, **row} for row in spec.sim_params.group("train"))]
     changes = collect_changes(spec, physics, 6, seed=0)
     assert changes.shape == (5, 6, 3)
     same = physics.index(physics[0], 1)

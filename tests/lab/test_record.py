@@ -114,7 +114,7 @@ def test_an_episode_is_filmed_under_the_physics_that_were_asked_for(run_dir, tmp
     asked = {"sim_params": {"length": 1.75}, "schedule": {4: {"mass": 2.0}}, "num_steps": 8}
     found = film_it("a.gif", **asked)
     assert (found.env, found.steps) == ("pendulum", 8)
-    assert found.sim_params == {"length": 1.75, "mass": 2.0}
+    assert found.sim_params == {"length": 1.75, "mass": 2.0, "gain": 1.0}
     assert Image.open(found.path).n_frames == 8
     again = film_it("b.gif", **asked)
     assert again.path.read_bytes() == found.path.read_bytes()

@@ -109,6 +109,8 @@ def test_score_is_zero_for_random_and_one_for_the_ceiling():
     assert score("pendulum", {"length": 0.6, "mass": 1.0}, -126, 200) is None
     assert score("pendulum", {"length": 0.5, "mass": 2.0}, -126, 200) is None
     assert score("pendulum", {"length": 0.5, "mass": 1.0}, -126, 100) is None
+    assert score("pendulum", {"gain": 1.0}, -131, 200) == 1  # the rest as in the unchanged one
+    assert score("pendulum", {"length": 0.5, "mass": 1.0, "gain": -1.0}, -126, 200) is None
     assert score("hopper", {"mass_scale": 1.0}, 10, 500) is None
 
 

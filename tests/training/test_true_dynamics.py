@@ -56,7 +56,7 @@ def play(environments, sequence):
 
 @pytest.mark.parametrize("env", CLASSIC)
 def test_compiled_equations_step_as_the_environment_under_every_physics(env):
-    physics = every_physics(env)
+    physics = [{**row, "gain": gain} for gain in (1.0, -0.7) for row in every_physics(env)]
     _, environments = begin(env, physics)
     vector = environments.vector
     assert isinstance(vector, ClassicVectorEnv)

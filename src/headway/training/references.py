@@ -49,13 +49,16 @@ def score(
 
     Args:
         env: Short name of the environment.
-        sim_params: The episode's simulator parameters.
+        sim_params: The episode's simulator parameters; others are the unchanged environment's.
         episode_return: Sum of rewards.
         length: Steps of an episode, if it does not end early.
 
     Returns:
         The score, or None where no reference is known for these physics and this length.
     """
+    if env not in _MEASURED:
+        return None
+    sim_params = {**env_spec(env).default_sim_params, **sim_params}
     for name, value in sim_params.items():
         found = _REFERENCES.get((env, length, name, value))
         others_nominal = all(sim_params[other] == 1.0 for other in sim_params if other != name)

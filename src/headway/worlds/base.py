@@ -32,7 +32,9 @@ class World:
     spec: ClassVar[EnvSpec]
     obs_dtype: ClassVar[type[np.floating]]
     choices: ClassVar[Mapping[str, tuple[float, ...]]] = {}
-    """Allowed values of the parameters that are no positive numbers."""
+    """Allowed values of the parameters that take only some."""
+    signed: ClassVar[tuple[str, ...]] = ()
+    """Parameters that may be 0 or negative; all others are positive."""
     obs_bounds: ClassVar[float | tuple[float, ...]] = math.inf
     """Largest absolute values of an observation."""
     time_step: float
@@ -60,9 +62,11 @@ class World:
             if name not in known:
                 raise ConfigError(str(unknown_name(f"{self.spec.name} sim_param", name, known)))
             number = float(value) if isinstance(value, numbers.Real) else math.nan
-            choices = self.choices.get(name)
-            if not (number in choices if choices else 0 < number < math.inf):
-                allowed = ", ".join(map(str, choices)) if choices else "finite numbers above 0"
+            choices, positive = self.choices.get(name), name not in self.signed
+            least = 0.0 if positive else -math.inf
+            if not (number in choices if choices else least < number < math.inf):
+                allowed = "finite numbers" + " above 0" * positive
+                allowed = ", ".join(map(str, choices)) if choices else allowed
                 raise ConfigError(
                     f"{self.spec.name} sim_params {name} is {value!r}, allowed: {allowed}."
                 )

@@ -29,6 +29,7 @@ class ClassicWorld(World):
     """
 
     obs_dtype = np.float32
+    signed = ("gain",)
     state_size: ClassVar[int]
 
     def terminated(self, next_state: np.ndarray) -> np.ndarray:
@@ -73,7 +74,7 @@ CARTPOLE_SWINGUP = EnvSpec(
         {"low": {"mass_scale": (0.1, 0.15)}, "high": {"mass_scale": (2.75, 3.0)}},
     ),
     episode_length=500,
-    default_sim_params={"mass_scale": 1.0},
+    default_sim_params={"mass_scale": 1.0, "gain": 1.0},
     options={"terminate_off_track": False},
     description="swing a pole of unknown mass up by its cart, also of unknown mass",
     noise_beta=0.25,
@@ -92,6 +93,7 @@ class CartPoleSwingUp(ClassicWorld):
     | action | force on the cart in units of 10 N, [-1, 1] |
     | reward | (1 + cos θ') / 2 after the step, from the observed cos θ' |
     | sim_params | `mass_scale`: cart and pole weigh 0.5 kg times this |
+    | | `gain`: the force is the action's times this; -1 pushes the other way, 0 not at all |
     | reset | Normal((0, 0, π, 0), 0.2) |
     | end | after 500 steps; option `terminate_off_track`: when abs(x') > 2.4 m |
     | step | 0.01 s, explicit Euler; g 9.82, pole 0.6 m, cart friction 0.1 |
@@ -117,7 +119,7 @@ class CartPoleSwingUp(ClassicWorld):
         g, length = self.gravity, self.pole_length
         _, v, angle, spin = xp.moveaxis(state, -1, 0)
         sin, cos = xp.sin(angle), xp.cos(angle)
-        push = self.force * action[..., 0] - self.friction * v
+        push = self.force * sim_params["gain"] * action[..., 0] - self.friction * v
         swing = m * length * xp.square(spin) * sin
         v_dot = (-2 * swing + 3 * m * g * sin * cos + 4 * push) / (4 * total - 3 * m * cos * cos)
         spin_dot = (-3 * swing * cos + 6 * total * g * sin + 6 * push * cos) / (
@@ -181,7 +183,7 @@ PENDULUM = EnvSpec(
         },
     ),
     episode_length=200,
-    default_sim_params={"length": 1.0, "mass": 1.0},
+    default_sim_params={"length": 1.0, "mass": 1.0, "gain": 1.0},
     description="swing a pendulum of unknown length up",
     epochs=5,
     noise_beta=0.25,
@@ -198,9 +200,10 @@ class Pendulum(ClassicWorld):
     | action | torque u (N m), [-2, 2] |
     | reward | -(θ² + 0.1 θ̇² + 0.001 u²) before the step, θ wrapped to ±π |
     | sim_params | `length` (m) and `mass` (kg) of the rod |
+    | | `gain`: the torque is u times this; -1 turns the other way, 0 not at all; u is paid for |
     | reset | θ uniform in ±π, θ̇ uniform in ±1 |
     | end | after 200 steps |
-    | step | 0.05 s: θ̇ += (1.5 g/l sin θ + 3 u/(m l²)) dt; θ += θ̇ dt; then θ̇ clipped to ±8; g 10 |
+    | step | 0.05 s: θ̇ += (1.5 g/l sin θ + 3 gain u/(m l²)) dt; θ += θ̇ dt; θ̇ clipped to ±8; g 10 |
 
     Source: supplement A.1 and OpenAI Gym 0.16 (which integrates before it clips).
     """
@@ -220,7 +223,8 @@ class Pendulum(ClassicWorld):
         angle, spin = xp.moveaxis(state, -1, 0)
         mass, length = sim_params["mass"], sim_params["length"]
         inertia = mass * xp.square(length)
-        spin_dot = 1.5 * self.gravity / length * xp.sin(angle) + 3.0 * action[..., 0] / inertia
+        torque = sim_params["gain"] * action[..., 0]
+        spin_dot = 1.5 * self.gravity / length * xp.sin(angle) + 3.0 * torque / inertia
         new_spin = spin + spin_dot * self.time_step
         new_angle = angle + new_spin * self.time_step
         new_spin = xp.clip(new_spin, -self.max_speed, self.max_speed)
@@ -232,7 +236,7 @@ class Pendulum(ClassicWorld):
         return xp.stack([xp.cos(angle), xp.sin(angle), spin], axis=-1).astype(np.float32)
 
     def reward(self, state: np.ndarray, action: np.ndarray, next_state: np.ndarray) -> np.ndarray:
-        """Minus the cost of angle, speed and torque before the step."""
+        """Minus the cost of angle, speed and commanded torque before the step."""
         del next_state
         angle, spin = np.moveaxis(state, -1, 0)
         wrapped = np.mod(angle + np.pi, 2 * np.pi) - np.pi

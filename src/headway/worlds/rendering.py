@@ -69,6 +69,7 @@ def cart_pole(state: np.ndarray, push: float, sim_params: Mapping[str, float]) -
     """Draw a cart with its pole and the force on it; heavier ones are drawn thicker."""
     canvas, track, length = _Canvas(), -0.25, CartPoleSwingUp.pole_length
     x, _, angle, _ = state
+    push = push * sim_params["gain"]
     bulk = float(np.clip(sim_params["mass_scale"], 0.05, 4.0)) ** (1 / 3)
     for mark in np.arange(-2.0, 2.1, 0.5):
         canvas.line((mark, track - 0.03), (mark, track - 0.07), 0.012, GRID)
@@ -91,7 +92,8 @@ def cart_pole(state: np.ndarray, push: float, sim_params: Mapping[str, float]) -
 def pendulum(state: np.ndarray, torque: float, sim_params: Mapping[str, float]) -> np.ndarray:
     """Draw a rod of its true length that turns around the middle, and an arc for the torque."""
     canvas, origin, radius = _Canvas(), (0.0, 0.0), 0.26
-    angle, length, torque = state[0], sim_params["length"], torque / PendulumTask.action_high[0]
+    angle, length = state[0], sim_params["length"]
+    torque = torque * sim_params["gain"] / PendulumTask.action_high[0]
     for distance in (0.5, 1.0, 1.5):
         canvas.disc(origin, distance, GRID, outline=SCALE)
     canvas.line((0.0, 1.6), (0.0, 1.85), 0.012, GRID)
