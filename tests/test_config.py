@@ -142,7 +142,7 @@ def test_a_setting_that_does_not_exist_is_refused_with_the_closest(wrong, said):
         ("planner.horizon", 10**30, "less than or equal to"),
         ("planner.optimizer.smoothing", 1.5, "less than or equal to 1"),
         ("planner.optimizer.name", "icm", "Did you mean 'icem'? Allowed: cem, icem, mppi, random"),
-        ("planner.num_particles", 7, "a multiple of model.num_members (5)"),
+        ("planner.num_particles", 7, "a multiple of model.num_members (5), or 1 without"),
         ("model.num_heads", -1, "greater than or equal to 1"),
         ("model.kind", "unheard", "Allowed: multi-headed, gradient-adapted, recurrent, "),
         ("model.hidden_sizes", 200, "a valid tuple"),
@@ -188,6 +188,8 @@ def test_settings_that_contradict_each_other_are_refused():
     related = MultiHeadedConfig(relation_head=True, num_heads=1)
     with pytest.raises(ConfigError, match=r"fitting\.precision is 'bfloat16', allowed: float32"):
         Config("hopper", model=related, fitting=FittingConfig(precision="bfloat16"))
+    with pytest.raises(ConfigError, match=r"num_particles is 10, allowed: 1 or model.num_memb"):
+        Config("hopper", planner=PlannerConfig(num_particles=10, particle_noise="none"))
 
 
 @pytest.mark.parametrize(

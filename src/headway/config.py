@@ -225,6 +225,8 @@ class FittingConfig:
     """First iterations, in which every head learns from all data independently."""
     epochs: Count = 50
     """Passes over the data per iteration."""
+    min_updates: CountOrNone = 0
+    """Updates per iteration at least: more passes while there are few data."""
     batch_size: Count = 256
     """Samples per member and update. Gradient-adapted: transitions per update, half of them to
     adapt to. Recurrent: transitions per update, in whole episodes, at least one."""
@@ -354,10 +356,12 @@ class PlannerConfig:
     num_iterations: Count = 5
     """Optimizer iterations per plan."""
     num_particles: Count = 20
-    """Imagined rollouts per candidate; a multiple of `model.num_members`."""
-    particle_noise: Literal["independent", "shared"] = "independent"
-    """Noise of imagined steps: every candidate's own, or shared by all, which is faster and
-    compares candidates under equal luck."""
+    """Imagined rollouts per candidate: a multiple of `model.num_members`, or 1: each candidate is
+    imagined by one member, and compared with those of the same one (wants `particle_noise` none).
+    """
+    particle_noise: Literal["independent", "shared", "none"] = "independent"
+    """Noise of imagined steps: every candidate's own; shared by all, which is faster and compares
+    candidates under equal luck; or none: steps are the predicted means, one rollout a member."""
     precision: Precision = "float32"
     """Type of the networks' products while planning; sums and states are always float32."""
     head_selection: Literal["adaptive", "average", "random"] = "adaptive"
@@ -471,8 +475,13 @@ class Config:
     def __post_init__(self):
         model, planner = self.model, self.planner
         simulated = model.kind == "simulator"
-        if planner.num_particles % model.num_members:
-            allowed = f"a multiple of model.num_members ({model.num_members})"
+        members = model.num_members
+        if planner.particle_noise == "none":
+            if planner.num_particles not in (1, members):
+                allowed = f"1 or model.num_members ({members}) without noise"
+                raise _refused(self, "planner.num_particles", allowed)
+        elif planner.num_particles % members:
+            allowed = f"a multiple of model.num_members ({members}), or 1 without particle_noise"
             raise _refused(self, "planner.num_particles", allowed)
         if planner.adaptation != "none" and model.kind in BUILT_IN_KINDS[1:]:
             allowed = f"none with a model of kind {model.kind}, which has no heads"

@@ -22,7 +22,8 @@ OBS = np.random.default_rng(2).normal(size=(3, 2)).astype(np.float32)
 
 
 def make_agent(**settings):
-    return toys.make_agent(toys.small_model(seed=3), num_particles=4, **settings)
+    settings = {"num_particles": 4, **settings}
+    return toys.make_agent(toys.small_model(seed=3), **settings)
 
 
 @pytest.fixture
@@ -38,6 +39,7 @@ def sharing(monkeypatch):
         (1, {"reward": "released", "selection_error": "sampled", "selection_skips_newest": True}),
         (2**20, {"num_candidates": 2, "optimizer": CEMConfig(num_elites=1)}),  # side by side
         (1, {"num_candidates": 41, "precision": "bfloat16", "particle_noise": "shared"}),
+        (2**20, {"num_candidates": 41, "num_particles": 1, "particle_noise": "none"}),
         *(
             pytest.param(caches, {"optimizer": optimizer}, marks=pytest.mark.slow)
             for caches, optimizer in [

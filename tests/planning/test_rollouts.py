@@ -12,7 +12,7 @@ from headway.config import ICEMConfig, MultiHeadedConfig, PlannerConfig
 from headway.models.folding import fold
 from headway.models.multi_headed import MultiHeadNet
 from headway.planning import cpu
-from headway.planning.rollouts import candidate_returns, plan_flop
+from headway.planning.rollouts import candidate_returns, plan_flop, within_members
 from headway.task import env_spec
 
 KEY = jax.random.key(0)
@@ -116,6 +116,25 @@ def test_particles_stay_with_their_member_for_the_whole_horizon():
     got = returns_of(dynamics, np.zeros((1, 2)), np.ones((1, 1, 6, 2), np.float32))
     far = -2 * sum(t**2 for t in range(1, 7)) - 6 * 0.2  # members that swapped would cancel out
     np.testing.assert_allclose(got, [[far]], rtol=1e-5)
+
+
+def test_a_single_particle_is_one_members_and_counts_from_the_mean_of_its_fellows():
+    opposite = np.stack([np.eye(2)[None], 3 * np.eye(2)[None]])
+    dynamics = dynamics_of(toys.linear_model(opposite), np.zeros((1, 2, 1), int))
+    planner = PlannerConfig(num_particles=1, particle_noise="none")
+    pushes = np.float32([0, 0, 1, 1, -1])[None, :, None, None] * np.ones(2, np.float32)
+    args = dynamics, toys.POINT, jnp.zeros((1, 2)), jnp.asarray(pushes)
+    whole = candidate_returns(*args, planner=planner, key=KEY)
+    np.testing.assert_allclose(whole, [[0, 0, -2.2, -18.2, -2.2]], atol=1e-5)
+    ends = [(0, 3), (2, 3)]  # shards overlap, and may begin at any member
+    parts = [candidate_returns(*args, planner=planner, key=KEY, shard=cpu.Shard(*s)) for s in ends]
+    np.testing.assert_allclose(cpu.joined(parts, 5), whole, rtol=1e-6)
+    means = -4.4 / 3, -9.1
+    own = np.array([0, 0, -2.2, -18.2, -2.2]) - np.array(means)[[0, 1, 0, 1, 0]]
+    found = within_members(whole, planner, 2)
+    np.testing.assert_allclose(found, [own + np.mean(means)], rtol=1e-5)
+    broken = within_members(whole.at[0, 1].set(np.nan).at[0, 3].set(-np.inf), planner, 2)
+    assert np.isfinite(broken).tolist() == [[True, False, True, False, True]]
 
 
 @pytest.mark.parametrize(

@@ -237,6 +237,17 @@ def test_odd_data_are_fitted_with_finite_numbers(settings):
         assert all(np.isfinite(x).all() for x in jax.tree.leaves(state.fit.model))
 
 
+@pytest.mark.parametrize(("least", "passes"), [(0, 2), (6, 2), (31, 7)])
+def test_few_data_are_gone_through_until_there_were_enough_updates(least, passes):
+    sizes = {"min_updates": least, "batch_size": 8, "future_length": 2, "epochs": 2}
+    settings = {f"fitting.{name}": size for name, size in sizes.items()}
+    trainer = make_trainer(runs.tiny_config(**settings))
+    assert trainer.num_epochs(episodes()) == passes  # 3 episodes of 6 and 5 pairs: 5 updates a pass
+    found = [stats for _, stats in trainer.fit(trainer.begin(), episodes(), 0, jax.random.key(0))]
+    assert len(found) == passes
+    assert {int(stats.updates) for stats in found} == {5}
+
+
 def test_a_head_that_wins_nothing_is_harmless():
     """It keeps its weights but for weight decay, owns nothing, and the agent acts without it."""
     trainer, state = fresh_model()

@@ -16,7 +16,7 @@ from headway.models.base import Model, Transition
 from headway.models.compilation import in_each_precision, jit_networks
 from headway.planning import cpu
 from headway.planning.optimizers import Optimizer, make_optimizer
-from headway.planning.rollouts import candidate_returns
+from headway.planning.rollouts import candidate_returns, within_members
 from headway.task import Task
 
 
@@ -158,7 +158,9 @@ class Agent(eqx.Module):
             returns = cpu.in_shards(returns_of, total, shards)
         else:
             returns = [jnp.asarray(plan.dynamics.returns(candidates))]
-        return plan._replace(search=_tell(optimizer, plan.search, candidates, returns))
+        members = getattr(plan.dynamics, "num_members", 1)  # a simulator has none
+        search = _tell(optimizer, plan.search, candidates, returns, self.planner, members)
+        return plan._replace(search=search)
 
     def end(self, plan: Plan) -> tuple[AgentState, Decision]:
         """The decision, by the search as it is now."""
@@ -206,7 +208,8 @@ def step(
 
     def score(candidates, key):
         args = plan.dynamics, agent.task, obs, candidates
-        return candidate_returns(*args, planner=agent.planner, key=key)
+        returns = candidate_returns(*args, planner=agent.planner, key=key)
+        return within_members(returns, agent.planner, plan.dynamics.num_members)
 
     project = agent.task.project_action
     search = agent.optimizer.optimize(score, plan.search, key=plan.key, project=project)
@@ -233,8 +236,11 @@ def _tell(
     search: Any,
     candidates: Float[Array, "env candidate horizon action"],
     returns: list[Float[Array, "env shard"]],
+    planner: PlannerConfig,
+    num_members: int,
 ) -> Any:
-    return optimizer.tell(search, candidates, cpu.joined(returns, candidates.shape[1]))
+    whole = cpu.joined(returns, candidates.shape[1])
+    return optimizer.tell(search, candidates, within_members(whole, planner, num_members))
 
 
 @eqx.filter_jit

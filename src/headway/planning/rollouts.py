@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -27,8 +28,11 @@ def candidate_returns(
 ) -> Float[Array, "env shard"]:
     """Mean return of each candidate over its particles, each staying with one member (TS∞).
 
-    Every imagined step draws a fresh sample of the delta. A particle whose episode has
-    terminated earns nothing more. Nothing is clipped: a rollout that leaves the finite
+    A candidate of a single particle is imagined by one member of the ensemble, the next candidate
+    by the next member (`within_members`).
+
+    Every imagined step draws a fresh sample of the delta, or takes its mean. A particle whose
+    episode has terminated earns nothing more. Nothing is clipped: a rollout that leaves the finite
     numbers gives a non-finite return, which ranks last. An environment's returns do not
     depend on the others: each has its own random stream.
 
@@ -45,65 +49,56 @@ def candidate_returns(
     if shard is not None:
         first_candidate, size = shard
         candidates = jax.lax.dynamic_slice_in_dim(candidates, first_candidate, size, axis=1)
-    num_envs, num_candidates, horizon, action_size = candidates.shape
+    num_envs, num_candidates, horizon, _ = candidates.shape
     ensemble, obs_size = dynamics.num_members, obs.shape[-1]
-    particles = planner.num_particles // ensemble
-    reward = over_rows(task.released_reward if planner.reward == "released" else task.reward)
-    terminated, scale_action = over_rows(task.terminated), over_rows(task.scale_action)
-    shared = planner.particle_noise == "shared"
+    alone = planner.num_particles < ensemble  # each candidate has one member
+    particles = 1 if alone else planner.num_particles // ensemble
+    reward = task.released_reward if planner.reward == "released" else task.reward
+    noise = planner.particle_noise if dynamics.stochastic else "none"
     # On a CPU noise is drawn before a rollout: XLA would draw it again for every operation of a
     # step that uses it. Elsewhere that would take too much memory.
-    in_steps = dynamics.stochastic and not shared and jax.default_backend() != "cpu"
+    in_steps = noise == "independent" and jax.default_backend() != "cpu"
 
     def roll_out(
         some: Dynamics, first: Int[Array, ""], obs, candidates, key
     ) -> Float[Array, "member particle candidate"]:
         """The return of every rollout of some members of one environment, from `first` on."""
-        rows = some.num_members, particles, num_candidates
+        members, step_noise, draw = some.num_members, None, None
 
-        def wide(values: Float[Array, "*member size"]) -> Float[Array, "member size particle cand"]:
-            return jnp.broadcast_to(values[..., None, None], (rows[0], values.shape[-1], *rows[1:]))
-
-        def draw(key) -> Float[Array, "member obs particle candidate"]:
+        def drawn(key) -> Float[Array, "member obs particle candidate"]:
             """One step's noise: the block of these members and candidates of the noise of all."""
             whole = ensemble, obs_size, particles, total
-            start, size = (first, 0, 0, first_candidate), (rows[0], obs_size, *rows[1:])
-            return cpu.normal_block(key, whole, start, size)
+            start, size = (first, 0, 0, first_candidate), (members, obs_size, particles)
+            return cpu.normal_block(key, whole, start, (*size, num_candidates))
 
-        def imagine(carry, step):
-            state, obs, alive, paid = carry
-            action, noise = step
-            action = jnp.broadcast_to(action[:, None], (rows[0], action_size, *rows[1:]))
-            state, next_obs = some.step(state, obs, action, draw(noise) if in_steps else noise)
-            action = scale_action(action)
-            paid = paid + jnp.where(alive, reward(obs, action, next_obs), 0.0)
-            alive = alive & ~terminated(obs, action, next_obs)
-            return (state, next_obs, alive, paid), None
-
-        noise = None
-        if dynamics.stochastic and shared:
+        if noise == "shared":
             of_all = jax.random.normal(key, (horizon, ensemble, obs_size, particles))[..., None]
-            noise = jax.lax.dynamic_slice_in_dim(of_all, first, rows[0], axis=1)
-        elif dynamics.stochastic:
+            step_noise = jax.lax.dynamic_slice_in_dim(of_all, first, members, axis=1)
+        elif noise == "independent":
             keys = jax.random.split(key, horizon)
-            noise = keys if in_steps else jax.vmap(draw)(keys)
-        state = jax.tree.map(wide, some.start())
-        begin = state, wide(obs), jnp.ones(rows, bool), jnp.zeros(rows)
-        (*_, paid), _ = jax.lax.scan(imagine, begin, (candidates.transpose(1, 2, 0), noise))
-        return paid
+            step_noise, draw = (keys, drawn) if in_steps else (jax.vmap(drawn)(keys), None)
+        noisy = step_noise, draw
+        return rollout_returns(some, task, reward, obs, candidates, particles, noisy)
 
-    bytes_per_env = 4 * dynamics.widest * ensemble * particles * num_candidates
+    bytes_per_env = 4 * dynamics.widest * planner.num_particles * num_candidates
     budget = cpu.activation_budget() if shard is None else cpu.CACHES_OF_CORE
     # Where one environment is too much for the caches of a core, its members take turns.
-    in_turns = shard is not None and ensemble > 1 and bytes_per_env > budget
+    in_turns = shard is not None and ensemble > 1 and not alone and bytes_per_env > budget
 
     def of_env(own, obs, candidates, key) -> Float[Array, " candidate"]:
-        one = dynamics.of_env(own)
+        one, none = dynamics.of_env(own), jnp.zeros((), jnp.int32)
+        if alone:
+            each = -(-num_candidates // ensemble)
+            # Each member's candidates, by their place in the shard; the last ones may be past it.
+            place = (jnp.arange(ensemble)[:, None] - first_candidate) % ensemble
+            place = place + ensemble * jnp.arange(each)
+            returns = roll_out(one, none, obs, candidates.at[place].get(mode="clip"), key)
+            return jnp.zeros(num_candidates).at[place].set(returns[:, 0], mode="drop")
         if not in_turns:
-            return roll_out(one, jnp.zeros((), jnp.int32), obs, candidates, key).mean((0, 1))
+            return roll_out(one, none, obs, candidates[None], key).mean((0, 1))
 
         def of_member(member: Int[Array, ""]) -> Float[Array, "particle candidate"]:
-            return roll_out(one.of_member(member), member, obs, candidates, key)[0]
+            return roll_out(one.of_member(member), member, obs, candidates[None], key)[0]
 
         return jax.lax.map(of_member, jnp.arange(ensemble)).mean((0, 1))
 
@@ -114,6 +109,71 @@ def candidate_returns(
         return jax.vmap(of_env)(*args)
     batch_size = at_once if at_once > 1 else None
     return jax.lax.map(lambda one: of_env(*one), args, batch_size=batch_size)
+
+
+def rollout_returns(
+    dynamics: Dynamics,
+    task: Task,
+    reward: Callable,
+    obs: Float[Array, " obs"],
+    candidates: Float[Array, "#member candidate horizon action"],
+    particles: int,
+    noise: tuple[Any, Callable | None],
+) -> Float[Array, "member particle candidate"]:
+    """Return of every rollout of one environment.
+
+    Args:
+        dynamics: Of that environment, of all members or one.
+        task: Termination, and the units of actions.
+        reward: The reward that counts.
+        obs: Where the environment is now.
+        candidates: Action sequences in [-1, 1], shared by the members or each one's own.
+        particles: Rollouts of a candidate with each member.
+        noise: Normal draws of every step, [horizon, member, obs, particle, #candidate], or None to
+            predict means; and what turns a step's part into the draws, if they are not drawn yet.
+    """
+    rows, (by_step, draw) = (dynamics.num_members, particles, candidates.shape[1]), noise
+    pays, ends, scale = map(over_rows, (reward, task.terminated, task.scale_action))
+
+    def wide(values: Float[Array, "*member size"]) -> Float[Array, "member size particle cand"]:
+        return jnp.broadcast_to(values[..., None, None], (rows[0], values.shape[-1], *rows[1:]))
+
+    def imagine(carry, step):
+        state, obs, alive, paid = carry
+        action, noise = step
+        action = jnp.broadcast_to(action[:, :, None], (rows[0], action.shape[1], *rows[1:]))
+        state, next_obs = dynamics.step(state, obs, action, draw(noise) if draw else noise)
+        action = scale(action)
+        paid = paid + jnp.where(alive, pays(obs, action, next_obs), 0.0)
+        alive = alive & ~ends(obs, action, next_obs)
+        return (state, next_obs, alive, paid), None
+
+    begin = jax.tree.map(wide, dynamics.start()), wide(obs), jnp.ones(rows, bool), jnp.zeros(rows)
+    (*_, paid), _ = jax.lax.scan(imagine, begin, (candidates.transpose(2, 0, 3, 1), by_step))
+    return paid
+
+
+def within_members(
+    returns: Float[Array, "env candidate"], planner: PlannerConfig, num_members: int
+) -> Float[Array, "env candidate"]:
+    """Returns that can be compared, whichever members imagined the candidates.
+
+    Candidate i with a single particle is imagined by member i modulo their number. A member that
+    promises more than the others would then choose the plan; so every return counts from the mean
+    of its member's, and all of them from the mean of all.
+
+    Args:
+        returns: Of all candidates.
+        planner: Its number of particles.
+        num_members: Members of the ensemble.
+    """
+    if planner.num_particles >= num_members:
+        return returns
+    mine = jnp.arange(returns.shape[1]) % num_members == jnp.arange(num_members)[:, None]
+    counted = mine[:, None] & jnp.isfinite(returns)
+    means = jnp.mean(jnp.broadcast_to(returns, counted.shape), -1, where=counted)
+    level = jnp.nanmean(means, 0)[:, None]
+    return returns - jnp.einsum("mc,me->ec", mine, jnp.nan_to_num(means)) + level
 
 
 def follow(

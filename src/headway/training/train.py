@@ -216,7 +216,7 @@ class _Training:
         return Batches(self.environments, self.config, phase, self.on_step, say, self.partial)
 
     def fit(self, key: PRNGKeyArray) -> tuple[dict[str, Any], float]:
-        """Renew the statistics and go through the data `epochs` times.
+        """Renew the statistics and go through the data `num_epochs` times.
 
         An epoch that diverges is made again from where the last good one ended, with a smaller
         step; the next iteration starts with the usual one.
@@ -227,7 +227,8 @@ class _Training:
         Raises:
             DivergenceError: It diverged again and again.
         """
-        self.begin_phase("fit", self.config.fitting.epochs)
+        epochs = self.trainer.num_epochs(self.data)
+        self.begin_phase("fit", epochs)
         iteration, partial, rollbacks, seconds = self.iteration, self.partial, 0, 0.0
         history: list[EpochStats] = []
         kept = partial.load("fit")
@@ -245,7 +246,7 @@ class _Training:
             facts["seconds"] = seconds + time.perf_counter() - started
             partial.save("fit", tree_arrays(self.state), facts)
 
-        while len(history) < self.config.fitting.epochs:
+        while len(history) < epochs:
             rate = max(1e-12, SLOWER**rollbacks * self.config.fitting.learning_rate)
             trainer = make_trainer(override(self.config, {"fitting.learning_rate": rate}))
             problem = None

@@ -69,6 +69,18 @@ class Trainer:
         del key
         return ()
 
+    def num_epochs(self, trajectories: Sequence[Trajectory]) -> int:
+        """Passes over the data in one iteration: `fitting.epochs`, more where data are few.
+
+        Args:
+            trajectories: All data so far.
+        """
+        fitting = self.config.fitting
+        offsets = range(fitting.future_length)
+        samples = sum(max(0, len(one) - offset) for one in trajectories for offset in offsets)
+        updates = -(-samples // fitting.batch_size)
+        return max(fitting.epochs, -(-fitting.min_updates // updates))
+
     def fit(
         self,
         state: Any,
@@ -193,7 +205,7 @@ class Fitted(Trainer):
         data = make_data(
             episodes, samples, statistics, fitting, num_members=model.num_members, key=data_key
         )
-        for epoch in range(first, fitting.epochs):
+        for epoch in range(first, self.num_epochs(trajectories)):
             shuffle = jax.random.fold_in(epoch_key, epoch)
             fit, stats = one_epoch(fit, self.setup, data, key=shuffle)
             yield TrainState(fit, statistics), jax.device_get(stats)
