@@ -5,11 +5,13 @@
     python results/figures.py returns results/cartpole-500-quick
     python results/figures.py arms results/adaptation/pendulum-quick NAME.png
     python results/figures.py changes results/adaptation/changes/pendulum NAME.png
-    python results/figures.py planners results/planners/pendulum.csv results/planners/pendulum.png
+    python results/figures.py planners results/planners/six.csv results/planners/six.png
+    python results/figures.py learning results/half-cheetah-mass-1/pets.csv NAME.png
     python results/figures.py ceilings results/ceilings
 
 Tables are printed as Markdown; a PNG file is drawn where one is named. `scores` and `returns` take
-a folder of METHOD/seed-N, `arms` and `changes` one table per run, `planners` one table.
+a folder of METHOD/seed-N, `arms` and `changes` one table per run, `planners` and
+`learning` one table.
 """
 
 import argparse
@@ -18,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from matplotlib.ticker import LogLocator, NullFormatter
 
 from headway.lab import figures
 from headway.training.references import score
@@ -180,47 +181,67 @@ def changes(folder: Path, figure: Path | None, reference: Path | None) -> None:
 
 
 def planners(path: Path, figure: Path | None, reference: Path | None) -> None:
-    """Score of planners, or return where no score is known, against their FLOP per step."""
+    """Return of planners by the networks they evaluate per step, and their share of the paper's.
+
+    The share is that of the way from random actions to the paper's planner, with the same models in
+    the same episodes.
+    """
     table = pd.read_csv(path)
-    value = "return_mean" if table.score.isna().any() else "score"
-    keys = ["planner", "physics"]
-    means = table.groupby(keys, sort=False)[["flop_per_step", "seconds_per_step", value]].mean()
-    cells = means.apply(
-        lambda row: f"{row.iloc[0] / 1e9:.3g}, {1e3 * row.iloc[1]:.3g}, {row.iloc[2]:.2f}", axis=1
+    table["physics"] = np.where(table.group == "train", "training", "unseen")
+    by = ["env", "physics", "planner"]
+    found = table.groupby(by, sort=False)[["network_evaluations_per_step", "return"]].mean()
+    found.columns = ["evaluations", "mean"]
+    random, paper = (
+        found["mean"].xs(name, level="planner").reindex(found.index.droplevel("planner")).values
+        for name in ("random actions", "paper")
     )
-    print(f"GFLOP, ms per step, {value}")
-    markdown(cells.unstack("physics"))
+    found["share"] = (found["mean"] - random) / (paper - random)
+    cells = found.apply(lambda row: f"{row['mean']:.0f} ({100 * row.share:.0f} %)", axis=1)
+    markdown(cells.unstack("planner").T)
     if figure is None:
         return
-    by_cost = means.groupby("planner").flop_per_step.mean().sort_values(kind="stable").index
-    numbers = {name: number for number, name in enumerate(by_cost, start=1)}
+    envs = list(found.index.unique("env"))
+    searches = [name for name in table.planner.unique() if name != "random actions"]
     caption = (
-        f"Means over {table.run.nunique()} runs of {path.stem}. Line: planners that no cheaper one"
-        " equals. FLOP: matrix products of the imagined rollouts that were evaluated."
+        "Share of the way from random actions to the paper's planner, same model, same episodes."
+        " Filled: training physics; hollow: unseen. Line: 97 %."
     )
-    title = f"{value.partition('_')[0].capitalize()} against planning cost"
-    with figures.figure(figure, title=title, caption=caption, size=(11.0, 4.6)) as drawing:
-        kinds = list(table.physics.unique())
-        *panels, key = drawing.subplots(1, len(kinds) + 1, width_ratios=[4] * len(kinds) + [2.2])
-        key.axis("off")
-        lines = [f"{number}  {name}" for name, number in numbers.items()]
-        key.text(0, 1, "\n".join(lines), va="top", fontsize=8, linespacing=1.5)
-        for axes, physics in zip(panels, kinds, strict=True):
-            found = means.xs(physics, level="physics").sort_values("flop_per_step")
-            x, y = found.flop_per_step / 1e9, found[value]
-            axes.step(x, y.cummax(), where="post", color=figures.FAINT, lw=1.0)
-            axes.plot(x, y, "o", color=figures.LABELS[0], ms=5)
-            for name in found.index:
-                axes.annotate(
-                    str(numbers[name]), (x[name], y[name]), (4, 3), textcoords="offset points"
-                )
+    title = "Return against networks evaluated per step"
+    with figures.figure(figure, title=title, caption=caption, size=(11.0, 6.4)) as drawing:
+        panels = drawing.subplots(2, 3, sharex=True).flat
+        for axes, env in zip(panels, envs, strict=False):
+            axes.axhline(0.97, color=figures.FAINT, lw=1.0)
+            for color, name in zip((*COLORS[1:], "k"), searches, strict=False):
+                for physics, fill in (("training", "full"), ("unseen", "none")):
+                    row = found.loc[(env, physics, name)]
+                    label = name if physics == "training" else None
+                    style = {"color": color, "fillstyle": fill, "ls": "", "label": label}
+                    axes.plot(row.evaluations, row.share, "o", ms=6, **style)
             axes.set_xscale("log")
-            axes.set_title(f"{physics} physics")
-            figures.numbers(axes, y=value.partition("_")[0])
-            axes.set_xlabel("GFLOP per step")
-            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axes.xaxis.set_major_formatter("{x:g}")
-            axes.xaxis.set_minor_formatter(NullFormatter())
+            axes.set_title(env)
+            figures.numbers(axes, y="share")
+            axes.set_xlabel("network evaluations per step")
+        handles, labels = axes.get_legend_handles_labels()
+        drawing.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
+
+
+def learning(path: Path, figure: Path | None, reference: Path | None) -> None:
+    """Return of the episodes that were collected, by the environment steps before their end."""
+    table = pd.read_csv(path)
+    mean = table.groupby(["arm", "step"], sort=False)["return"].mean()
+    last = mean.groupby("arm", sort=False).tail(5).groupby("arm", sort=False).mean()
+    markdown(last.round(0).rename("mean return of the last five"))
+    if figure is None:
+        return
+    title = f"Return while learning: {path.parent.name.replace('-', ' ')}"
+    caption = "Each point is the mean of the episodes of one iteration; the first acts at random."
+    with figures.figure(figure, title=title, caption=caption, size=(7.5, 4.2)) as drawing:
+        axes = drawing.subplots()
+        for color, (arm, found) in zip(COLORS[1:], mean.groupby("arm", sort=False), strict=False):
+            axes.plot(found.index.get_level_values("step"), found, "o-", ms=3, c=color, label=arm)
+        axes.legend(loc="upper left")
+        figures.numbers(axes, y="return")
+        axes.set_xlabel("environment steps")
 
 
 def ceilings(folder: Path, figure: Path | None, reference: Path | None) -> None:
@@ -234,7 +255,7 @@ def ceilings(folder: Path, figure: Path | None, reference: Path | None) -> None:
 
 def main() -> None:
     """Print a table; draw a figure where a file is named."""
-    made = {f.__name__: f for f in (scores, returns, arms, changes, planners, ceilings)}
+    made = {f.__name__: f for f in (scores, returns, arms, changes, planners, learning, ceilings)}
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("what", choices=made)
     parser.add_argument("source", type=Path, help="folder or CSV file")

@@ -168,9 +168,8 @@ class EnvSpec:
     """One line for lists."""
     epochs: int = 50
     """Passes over the data per iteration at the paper's scale (supplement A.2)."""
-    noise_beta: float | None = None
-    """Exponent of the power spectrum of the noise with which iCEM searches in the presets `fast`
-    and `quick`; None searches with CEM, whose noise is white."""
+    quick: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Settings of the preset `quick` that are this environment's own, by dotted name."""
     obs_names: tuple[str, ...] = ()
     """Entries of an observation with their units, for figures; unnamed ones are numbered."""
 

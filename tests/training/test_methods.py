@@ -30,13 +30,13 @@ def test_paper_preset_is_the_defaults_its_own_search_and_the_environments_epochs
 
 @pytest.mark.parametrize("method", ["tmcl", "pets"])
 @pytest.mark.parametrize("env", ["hopper", "pendulum"])
-def test_fast_preset_plans_with_a_tenth_of_the_papers_arithmetic_and_changes_nothing_else(
+def test_fast_preset_plans_with_a_hundredth_of_the_papers_arithmetic_and_changes_nothing_else(
     method, env
 ):
     paper, fast = (make_config(env, method=method, preset=name) for name in ("paper", "fast"))
     task = env_spec(env).make_task()
     costs = [plan_flop(config.model, config.planner, task) for config in (paper, fast)]
-    assert 10 * costs[1] <= costs[0]
+    assert 100 * costs[1] <= costs[0]
     assert dataclasses.replace(fast, preset="paper", planner=paper.planner) == paper
 
 
@@ -59,7 +59,10 @@ def test_released_code_preset_flips_the_choices_that_differ():
 
 
 def test_method_wins_over_preset_and_user_over_both():
-    for settings, particles in (({}, 1), ({"planner.num_particles": 4}, 4)):
+    for settings, particles in (
+        ({}, 1),
+        ({"planner.num_particles": 4, "planner.particle_noise": "shared"}, 4),
+    ):
         config = make_config("pendulum", method="vanilla", preset="quick", settings=settings)
         assert config.planner.num_particles == particles
 

@@ -161,22 +161,17 @@ METHODS: dict[str, Method] = {method.name: method for method in _METHODS}
 
 PAPERS_SEARCH = {"planner.optimizer.narrow_at_bounds": True}
 SMALL_SEARCH = {
+    "planner.optimizer.name": "icem",
+    "planner.optimizer.num_elites": 10,
+    "planner.optimizer.noise_beta": 0.25,
+    "planner.optimizer.initial_std": 0.3,
+    "planner.horizon": 20,
     "planner.num_candidates": 100,
-    "planner.optimizer.num_elites": 20,
     "planner.num_iterations": 3,
-    "planner.num_particles": 5,
+    "planner.num_particles": 1,
+    "planner.particle_noise": "none",
 }
-
-
-def _small_search(spec: EnvSpec) -> Settings:
-    if spec.noise_beta is None:
-        return SMALL_SEARCH
-    return {
-        **SMALL_SEARCH,
-        "planner.optimizer.name": "icem",
-        "planner.optimizer.num_elites": 10,
-        "planner.optimizer.noise_beta": spec.noise_beta,
-    }
+"""At most 1 % of the paper's arithmetic, for its return or more (docs/methods.md)."""
 
 
 def _released_code(spec: EnvSpec) -> Settings:
@@ -199,14 +194,13 @@ def _quick(spec: EnvSpec) -> Settings:
         "model.hidden_sizes": (128, 128, 128, 128),
         "collection.num_iterations": 5,
         "collection.num_episodes": 5,
-        "collection.episode_length": min(spec.episode_length, 200),
         "fitting.epochs": 20,
         "fitting.warmup_iterations": 2,
         "fitting.relation_transitions": 20,
-        "planner.horizon": 20,
-        **_small_search(spec),
+        **SMALL_SEARCH,
         "evaluation.every": 5,
         "evaluation.num_episodes": 8,
+        **spec.quick,
     }
 
 
@@ -240,10 +234,14 @@ _PRESETS = (
     ),
     Preset(
         "fast",
-        "the paper's, but for a planner of at most a tenth of its arithmetic",
-        lambda spec: {"fitting.epochs": spec.epochs, **_small_search(spec)},
+        "the paper's, but for a planner of a hundredth of its arithmetic",
+        lambda spec: {"fitting.epochs": spec.epochs, **SMALL_SEARCH},
     ),
-    Preset("quick", "a smaller network, planner and schedule; minutes on a laptop", _quick),
+    Preset(
+        "quick",
+        "a smaller network and schedule; minutes on a laptop, half an hour for a robot",
+        _quick,
+    ),
     Preset("smoke", "tiny sizes that only show that everything runs; seconds", _smoke),
     Preset(
         "released-code",

@@ -77,7 +77,6 @@ CARTPOLE_SWINGUP = EnvSpec(
     default_sim_params={"mass_scale": 1.0, "gain": 1.0},
     options={"terminate_off_track": False},
     description="swing a pole of unknown mass up by its cart, also of unknown mass",
-    noise_beta=0.25,
     obs_names=(
         "cart position (m)", "cart velocity (m/s)", "cos θ", "sin θ", "pole rate (rad/s)",
     ),
@@ -186,7 +185,6 @@ PENDULUM = EnvSpec(
     default_sim_params={"length": 1.0, "mass": 1.0, "gain": 1.0},
     description="swing a pendulum of unknown length up",
     epochs=5,
-    noise_beta=0.25,
     obs_names=("cos θ", "sin θ", "angular velocity (rad/s)"),
 )
 

@@ -24,6 +24,16 @@ GREY = (0.42, 0.44, 0.47, 1.0)
 """Colour of a crippled leg."""
 
 
+QUICK = {
+    "collection.num_iterations": 10,
+    "collection.num_episodes": 10,
+    "fitting.epochs": 1,
+    "fitting.min_updates": 4000,
+    "evaluation.every": 10,
+}
+"""As much data as the paper's. 4,000 updates are enough for what they teach (docs/methods.md)."""
+
+
 class RobotState(NamedTuple):
     """State of one or many robots."""
 
@@ -178,6 +188,7 @@ HOPPER = EnvSpec(
     episode_length=500,
     default_sim_params={"mass_scale": 1.0, "damping_scale": 1.0},
     options={"scale_inertia": False, "observe_average_velocity": True},
+    quick=QUICK,
     description="hop forward on one leg with unknown masses",
     obs_names=(
         "height (m)", "torso pitch (rad)", *_joints("thigh, leg, foot", *_PLANAR),
@@ -256,6 +267,7 @@ SLIM_HUMANOID = EnvSpec(
     episode_length=1000,
     default_sim_params={"mass_scale": 1.0, "damping_scale": 1.0},
     options={"scale_inertia": False},
+    quick=QUICK,
     description="walk upright as a humanoid with unknown masses",
     obs_names=(
         "height (m)", *_QUATERNION, *_joints(
@@ -351,6 +363,7 @@ HALF_CHEETAH = EnvSpec(
     episode_length=1000,
     default_sim_params={"mass_scale": 1.0, "damping_scale": 1.0},
     options={"scale_inertia": False},
+    quick=QUICK,
     description="run forward on two legs with unknown masses",
     obs_names=(
         "average x velocity (m/s)", "height (m)", "torso pitch (rad)",
@@ -421,6 +434,7 @@ CRIPPLED_ANT = EnvSpec(
     episode_length=1000,
     default_sim_params={"crippled_leg": -1.0},
     options={"shrink_leg": False},
+    quick=QUICK,
     description="walk on four legs, one of which does not obey",
     obs_names=(
         "x (m)", "y (m)", "height (m)", *_QUATERNION,
