@@ -188,41 +188,39 @@ def planners(path: Path, figure: Path | None, reference: Path | None) -> None:
     """
     table = pd.read_csv(path)
     table["physics"] = np.where(table.group == "train", "training", "unseen")
-    by = ["env", "physics", "planner"]
-    found = table.groupby(by, sort=False)[["network_evaluations_per_step", "return"]].mean()
-    found.columns = ["evaluations", "mean"]
-    random, paper = (
-        found["mean"].xs(name, level="planner").reindex(found.index.droplevel("planner")).values
-        for name in ("random actions", "paper")
-    )
-    found["share"] = (found["mean"] - random) / (paper - random)
-    cells = found.apply(lambda row: f"{row['mean']:.0f} ({100 * row.share:.0f} %)", axis=1)
-    markdown(cells.unstack("planner").T)
+    names = list(table.planner.unique())  # in the order they were tested
+    by = {"index": ["env", "physics"], "columns": "planner", "sort": False}
+    means = table.pivot_table(values="return", **by)[names]
+    cost = table.pivot_table(values="network_evaluations_per_step", **by)
+    random, paper = means["random actions"], means["paper"]
+    share = means.sub(random, axis=0).div(paper - random, axis=0)
+    markdown((means.round().astype(int).astype(str) + " (" + share.map("{:.0%}".format) + ")").T)
     if figure is None:
         return
-    envs = list(found.index.unique("env"))
-    searches = [name for name in table.planner.unique() if name != "random actions"]
+    envs = list(dict.fromkeys(table.env))
     caption = (
         "Share of the way from random actions to the paper's planner, same model, same episodes."
         " Filled: training physics; hollow: unseen. Line: 97 %."
     )
     title = "Return against networks evaluated per step"
-    with figures.figure(figure, title=title, caption=caption, size=(11.0, 6.4)) as drawing:
-        panels = drawing.subplots(2, 3, sharex=True).flat
+    rows, columns = -(-len(envs) // 3), min(3, len(envs))
+    size = 4.0 * columns + 2.5, 3.4 * rows + 0.6
+    with figures.figure(figure, title=title, caption=caption, size=size) as drawing:
+        panels = drawing.subplots(rows, columns, squeeze=False).flat
         for axes, env in zip(panels, envs, strict=False):
             axes.axhline(0.97, color=figures.FAINT, lw=1.0)
-            for color, name in zip((*COLORS[1:], "k"), searches, strict=False):
+            for color, name in zip((*COLORS[1:], "k"), names[1:], strict=False):
                 for physics, fill in (("training", "full"), ("unseen", "none")):
-                    row = found.loc[(env, physics, name)]
-                    label = name if physics == "training" else None
+                    label = name if (env, physics) == (envs[0], "training") else None
                     style = {"color": color, "fillstyle": fill, "ls": "", "label": label}
-                    axes.plot(row.evaluations, row.share, "o", ms=6, **style)
+                    place = (env, physics), name
+                    axes.plot(cost.loc[place], share.loc[place], "o", ms=6, **style)
             axes.set_xscale("log")
             axes.set_title(env)
             figures.numbers(axes, y="share")
             axes.set_xlabel("network evaluations per step")
-        handles, labels = axes.get_legend_handles_labels()
-        drawing.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
+            axes.xaxis.set_major_formatter("{x:,.0f}")
+        drawing.legend(loc="outside right center", fontsize=8)
 
 
 def learning(path: Path, figure: Path | None, reference: Path | None) -> None:
@@ -230,7 +228,7 @@ def learning(path: Path, figure: Path | None, reference: Path | None) -> None:
     table = pd.read_csv(path)
     mean = table.groupby(["arm", "step"], sort=False)["return"].mean()
     last = mean.groupby("arm", sort=False).tail(5).groupby("arm", sort=False).mean()
-    markdown(last.round(0).rename("mean return of the last five"))
+    markdown(last.round(0).to_frame("mean return of the last five"))
     if figure is None:
         return
     title = f"Return while learning: {path.parent.name.replace('-', ' ')}"
