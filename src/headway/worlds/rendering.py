@@ -125,6 +125,7 @@ def restyle(spec: Any) -> None:
             texture.rgb1, texture.rgb2 = (0.62, 0.64, 0.65), (0.74, 0.75, 0.75)
     for material in spec.materials:
         material.reflectance, material.specular = 0.0, 0.1
+        material.texrepeat = (0.75, 0.75)  # tiles per metre of the floor
     for light in spec.lights:
         light.diffuse, light.specular = (0.55, 0.55, 0.55), (0.15, 0.15, 0.15)
         light.dir = (0.15, 0.25, -1.0)
@@ -133,12 +134,13 @@ def restyle(spec: Any) -> None:
 
 
 def paint(model: Any) -> None:
-    """Colour the torso of an `MjModel` blue and the limbs orange, darker on the far side."""
+    """Colour the torso of an `MjModel` blue and the limbs orange; draw its floor without end."""
     torso, near, far = (0.20, 0.40, 0.64, 1.0), (0.80, 0.47, 0.24, 1.0), (0.62, 0.33, 0.16, 1.0)
     for geom in range(model.ngeom):
         body = model.geom_bodyid[geom]
         if body == 0:
             model.geom_rgba[geom] = 1.0
+            model.geom_size[geom, :2] = 0.0  # without end, as it is to physics: robots run far
             continue
         behind = model.body(body).name.startswith(("left", "fthigh", "fshin", "ffoot"))
         model.geom_matid[geom] = -1
