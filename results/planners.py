@@ -30,11 +30,12 @@ SPREAD = {"initial_std": 0.3, "noise_beta": 0.25}
 def search(name: str, candidates: int, iterations: int, horizon: int, particles: int, **own: Any):
     """Settings of a search; its steps are means unless `particle_noise` says otherwise."""
     noise = own.pop("particle_noise", "none")
-    numbers = {"num_candidates": candidates, "num_iterations": iterations, "horizon": horizon}
     return {
         "optimizer.name": name,
         **{f"optimizer.{setting}": value for setting, value in own.items()},
-        **numbers,
+        "num_candidates": candidates,
+        "num_iterations": iterations,
+        "horizon": horizon,
         "num_particles": particles,
         "particle_noise": noise,
     }
@@ -57,14 +58,14 @@ PLANNERS: dict[str, dict[str, Any]] = {
 def episodes_of(run: RunDir, name: str, asked: argparse.Namespace) -> list[dict[str, Any]]:
     """A row for every test episode under a planner."""
     groups, number, planner = asked.groups, asked.episodes, PLANNERS[name]
-    size = {"collection.num_episodes": number * len(groups), "evaluation.num_episodes": number}
     config = override(
         run.config(),
         {
-            **size,
+            "collection.num_episodes": number * len(groups),
+            "evaluation.num_episodes": number,
             "collection.episode_length": asked.steps,
             "planner.precision": "bfloat16",
-            **{f"planner.{name}": value for name, value in planner.items()},
+            **{f"planner.{setting}": value for setting, value in planner.items()},
         },
     )
     with closing(Environments.make(config)) as environments:

@@ -31,7 +31,7 @@ QUICK = {
     "fitting.min_updates": 4000,
     "evaluation.every": 10,
 }
-"""As many steps as the paper's. More updates teach no more (docs/methods.md)."""
+"""As many steps as the paper's; with fewer updates PETS learned nothing (results/README.md)."""
 QUICK_OF_FALLERS = {**QUICK, "collection.num_episodes": 50, "collection.episode_length": 200}
 """The same steps in short episodes: who has fallen stays down, and most data would be of that."""
 
