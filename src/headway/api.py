@@ -1,13 +1,16 @@
 """Train and load. Importing this, and loading a controller, bring in no simulator."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from headway.config import Config
+from headway.errors import ConfigError
 from headway.models.compilation import prepare_jax
 from headway.planning.controller import Controller
+from headway.sim_params import SimParamSets
+from headway.task import EnvSpec, Task, name_spec
 from headway.training.evaluate import returns_in_words
 from headway.training.methods import config_to_evaluate, make_config
 from headway.training.progress import Progress
@@ -47,8 +50,10 @@ class Run:
 
 
 def train(  # noqa: PLR0913 (keywords, all with a default)
-    env: str,
+    env: str | EnvSpec | Callable[..., Any],
     *,
+    task: Task | Callable[..., Task] | None = None,
+    sim_params: SimParamSets | Mapping[str, Any] | None = None,
     method: str = "tmcl",
     preset: str = "paper",
     seed: int = 0,
@@ -63,7 +68,12 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
     A finished run goes on where `collection.num_iterations` is larger than before.
 
     Args:
-        env: Short name or id of an environment.
+        env: Short name or id of an environment; an EnvSpec; or, with a task, any id that Gymnasium
+            knows or what makes the environment. Another process must know an EnvSpec, too:
+            where a module holds it, it finds it, else `headway.register` tells it.
+        task: The Task of an environment that has no EnvSpec, or its class.
+        sim_params: Physics of that environment, `{"train": {...}, "unseen": {...}}`, and
+            instead of those of another.
         method: A name from `headway list methods`.
         preset: A name from `headway list presets`.
         seed: Makes the run repeatable.
@@ -85,8 +95,21 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
         DivergenceError: Fitting lost all finite numbers.
     """
     prepare_jax()
+    if isinstance(sim_params, Mapping):
+        sim_params = SimParamSets.from_dict(sim_params)
+    if task is not None:
+        if isinstance(env, EnvSpec) or sim_params is None:
+            raise ConfigError(
+                "task is given without sim_params or with an EnvSpec, allowed: task and sim_params"
+                " with an id or what makes the environment; an EnvSpec has a Task."
+            )
+        make_task = (lambda: task) if isinstance(task, Task) else task
+        env = EnvSpec(env_id=env, make_task=make_task, sim_params=sim_params)
+    elif sim_params is not None:
+        settings = {**(settings or {}), "sim_params": sim_params}
+    env = name_spec(env)
     config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
-    name = f"{config.env}-{method}-{preset}-seed{seed}".replace(":", "-")
+    name = f"{config.env}-{method}-{preset}-seed{seed}".replace(":", "-").replace("/", "-")
     path = run_dir or Path("runs") / name
     run = train_run(
         config, path, progress, on_iteration, resume_from_last_good=resume_from_last_good

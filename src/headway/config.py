@@ -403,6 +403,8 @@ class CollectionConfig:
     """Rounds of collecting and fitting; the first one acts at random."""
     num_episodes: Count = 10
     """Episodes per iteration, all stepped and planned together."""
+    min_steps: CountOrNone = 0
+    """Steps per iteration at least: more rounds of `num_episodes` while episodes end early."""
     episode_length: CountOrNone = 0
     """Steps per episode; 0 takes the environment's own."""
     max_bad_episodes: CountOrNone = 1

@@ -107,6 +107,18 @@ class SimParamSets:
             for name, values in self.train.items()
         }
 
+    def deal(self, rng: np.random.Generator, count: int) -> list[dict[str, float]]:
+        """Draw so many training physics, with every value of a parameter about equally often."""
+        columns = {}
+        for name, values in self.train.items():
+            places = rng.permutation(count)
+            if isinstance(values, Uniform):
+                shares = (places + rng.random(count)) / count
+                columns[name] = values.low + shares * (values.high - values.low)
+            else:
+                columns[name] = rng.permutation(values)[places % len(values)]
+        return [{name: float(column[i]) for name, column in columns.items()} for i in range(count)]
+
     def nearest(self, sim_params: Mapping[str, float]) -> dict[str, float]:
         """Return the training physics of `group` that drawn ones are counted with."""
         return {

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from headway.errors import ConfigError, one_line, shown, unknown_name
+from headway.errors import ConfigError, UnknownNameError, one_line, shown, unknown_name
 from headway.sim_params import SimParamSets
 from headway.spaces import Spaces
 
@@ -141,7 +141,7 @@ def scaled_action(task: Task, action: HostAction) -> HostScaled:
     return task.spaces.unscale(action.astype(np.float64), np).astype(np.float32)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class EnvSpec:
     """Name, physics and scale of an environment, and how its Task is made.
 
@@ -149,8 +149,8 @@ class EnvSpec:
         ConfigError: It contradicts itself.
     """
 
-    name: str
-    """Short name, as the command line takes it."""
+    name: str = ""
+    """Short name, as the command line takes it; by default that of what makes the environment."""
     env_id: str | Callable[..., Any]
     """Any id that `gymnasium.make` takes, also `"module:Env-v0"`; or what makes the environment,
     a class or a function. It takes the options as keywords and, to be filmed, `render_mode`."""
@@ -158,9 +158,9 @@ class EnvSpec:
     """Builds the Task; takes those of the options as keywords that it depends on."""
     sim_params: SimParamSets
     """Physics to train on and to test on; passed to `reset` as `options["sim_params"]`."""
-    episode_length: int
-    """Steps after which an episode is cut."""
-    default_sim_params: Mapping[str, float]
+    episode_length: int = 0
+    """Steps after which an episode is cut; 0 takes the time limit of the id in Gymnasium."""
+    default_sim_params: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """The physics of the unchanged environment, also parameters that `sim_params` leaves alone."""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Options of the environment, with their defaults; anything that JSON holds."""
@@ -174,12 +174,15 @@ class EnvSpec:
     """Entries of an observation with their units, for figures; unnamed ones are numbered."""
 
     def __post_init__(self) -> None:
-        known = set(self.default_sim_params) >= set(self.sim_params.names)
-        if not (self.name and self.episode_length >= 1 and self.epochs >= 1 and known):
+        made = self.env_id if isinstance(self.env_id, str) else getattr(self.env_id, "__name__", "")
+        object.__setattr__(self, "name", self.name or made.strip("<>"))
+        default = self.default_sim_params
+        known = not default or set(default) >= set(self.sim_params.names)
+        if not (self.name and self.episode_length >= 0 and self.epochs >= 1 and known):
             raise ConfigError(
                 f"environment {self.name!r} has episode_length {self.episode_length}, epochs"
-                f" {self.epochs} and default_sim_params for {sorted(self.default_sim_params)},"
-                " allowed: a name, at least 1 each, and also its sim_params,"
+                f" {self.epochs} and default_sim_params for {sorted(default)},"
+                " allowed: a name, at least 0 and 1, and none or also its sim_params,"
                 f" {sorted(self.sim_params.names)}."
             )
         try:
@@ -226,6 +229,29 @@ def register(spec: EnvSpec) -> None:
     _registered[spec.name] = spec
 
 
+def name_spec(env: Any) -> str:
+    """A name by which `env_spec` finds an environment, which is registered if need be.
+
+    Args:
+        env: A name, or an EnvSpec; one that a module holds is named so that any process finds it.
+
+    Raises:
+        ConfigError: It is neither, or has the name of a built-in environment.
+    """
+    if isinstance(env, str):
+        return env
+    if not isinstance(env, EnvSpec):
+        raise ConfigError(
+            f"env is {shown(env)}, allowed: a name, an EnvSpec, or with task=... what makes it."
+        )
+    for module in list(sys.modules.values()):
+        for key, value in list(getattr(module, "__dict__", {}).items()):
+            if value is env and module.__name__ != "__main__":
+                return f"{module.__name__}:{key}"
+    register(env)
+    return env.name
+
+
 def env_names() -> list[str]:
     """Return the short names of the built-in and the registered environments."""
     return [*BUILT_IN, *_registered]
@@ -254,7 +280,9 @@ def env_spec(name: str) -> EnvSpec:
         if str(Path.cwd()) not in sys.path:  # a console script does not look there
             sys.path.append(str(Path.cwd()))
         return dataclasses.replace(_imported(name), name=name)
-    raise unknown_name("environment", name, by_id if "/" in name else env_names())
+    error = unknown_name("environment", name, by_id if "/" in name else env_names())
+    advice = " One of your own is module:name of its EnvSpec, or is known after headway.register."
+    raise UnknownNameError(f"{error}{advice}")
 
 
 @functools.cache

@@ -144,7 +144,14 @@ def test_a_simulation_that_diverges_costs_its_own_episode_only(tmp_path, monkeyp
 
 gymnasium.register("own/VectorDrift-v0", "misbehaving:Drift")
 SETS = SimParamSets({"drift": (1.0, 2.0)}, {"far": {"drift": (5.0,)}})
-DRIFT = EnvSpec("drift", "own/VectorDrift-v0", PendulumTask, SETS, 6, {"drift": 1.0})
+DRIFT = EnvSpec(
+    name="drift",
+    env_id="own/VectorDrift-v0",
+    make_task=PendulumTask,
+    sim_params=SETS,
+    episode_length=6,
+    default_sim_params={"drift": 1.0},
+)
 MOON = dataclasses.replace(
     env_spec("hopper"),
     name="moon-hopper",

@@ -156,7 +156,8 @@ def own(run_dir, tmp_path):
 
     def begin(make_env, **changes):
         sets = SimParamSets({"drift": Uniform(0.5, 1)}, {"far": {"drift": (3.0,)}})
-        register(EnvSpec("own", make_env, PendulumTask, sets, 20, {"drift": 1.0}, {"how": ""}))
+        own = {"name": "own", "env_id": make_env, "make_task": PendulumTask, "options": {"how": ""}}
+        register(EnvSpec(**own, sim_params=sets, episode_length=20))
         run = RunDir(tmp_path / "own")
         run.begin(make_config("own", preset="smoke", settings=changes))
         return run.path

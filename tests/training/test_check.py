@@ -75,8 +75,8 @@ def cart(monkeypatch):
     def make(make_task=CartTask, entry=Cart, sets=SETS, **fault):
         gymnasium.registry.pop("own/Cart-v0", None)
         gymnasium.register("own/Cart-v0", entry, kwargs=fault)
-        defaults = {name: values[0] for name, values in sets.train.items()}
-        spec = headway.EnvSpec("cart", "own/Cart-v0", make_task, sets, 20, defaults)
+        own = {"name": "cart", "env_id": "own/Cart-v0", "make_task": make_task}
+        spec = headway.EnvSpec(**own, sim_params=sets, episode_length=20)
         headway.register(spec)
         return spec
 

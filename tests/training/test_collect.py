@@ -32,7 +32,8 @@ def drift():
 
     make()
     sets = SimParamSets({"drift": (0.5, 1.0)}, {"far": {"drift": (FAR,)}})
-    register(EnvSpec("drift", "own/Drift-v0", PendulumTask, sets, 6, {"drift": 0.5}))
+    own = {"name": "drift", "env_id": "own/Drift-v0", "make_task": PendulumTask}
+    register(EnvSpec(**own, sim_params=sets, episode_length=6))
     yield make
     del gymnasium.registry["own/Drift-v0"], task._registered["drift"]
 

@@ -5,6 +5,7 @@ from .built_in import HeadwayEnv as HeadwayEnv
 from .built_in import RobotVectorEnv as RobotVectorEnv
 from .built_in import make as make
 from .built_in import make_vec as make_vec
+from .physics import MujocoPhysics as MujocoPhysics
 from .vector import HeadwayVectorEnv as HeadwayVectorEnv
 from .vector import ProcessVectorEnv as ProcessVectorEnv
 from .vector import SequentialVectorEnv as SequentialVectorEnv

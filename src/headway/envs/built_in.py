@@ -20,6 +20,7 @@ from gymnasium.spaces import Box
 from jaxtyping import Float
 
 from headway.cpus import num_cpus
+from headway.envs.physics import adapted
 from headway.envs.vector import HeadwayVectorEnv, ProcessVectorEnv, SequentialVectorEnv, SimParams
 from headway.errors import BrokenEpisodeError, ConfigError
 from headway.sim_params import SimParamSets
@@ -399,7 +400,7 @@ def make(name: str, **kwargs: Any) -> gymnasium.Env:
         gymnasium.error.Error: Gymnasium does not know the environment's id.
     """
     spec = env_spec(name)
-    return _maker(spec)(**{**spec.options, **kwargs})
+    return adapted(_maker(spec), None, **{**spec.options, **kwargs})
 
 
 def _maker(spec: EnvSpec) -> Callable[..., gymnasium.Env]:
@@ -413,7 +414,13 @@ def registered(env_id: str) -> Any:
     """Gymnasium's entry of an id, which may name a module and lack a version, as for `make`."""
     module, _, env_id = env_id.rpartition(":")
     if module:
-        importlib.import_module(module)
+        try:
+            importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            raise ConfigError(
+                f"{module}:{env_id} wants the module {error.name}, which is missing; install it,"
+                " for dm_control by `pip install 'headway[dm-control]'`."
+            ) from error
     namespace, name, version = parse_env_id(env_id)
     if version is None:
         version = find_highest_version(namespace, name)
@@ -453,7 +460,7 @@ def make_vec(
     spec = env_spec(name)
     given: dict[str, Any] = {**spec.options, **(options or {})}
     sets = sim_params or spec.sim_params
-    length = spec.episode_length if episode_length is None else episode_length
+    length = (spec.episode_length or None) if episode_length is None else episode_length
     world, draws = _WORLDS.get(spec.env_id), None
     if world is not None and step_timeout_s is None:
         return _vector(world(sets, **given), num_envs, length)
@@ -463,9 +470,9 @@ def make_vec(
         given["sim_params"] = sets
     if render_mode is not None:
         given["render_mode"] = render_mode
-    if isinstance(spec.env_id, str):
+    if isinstance(spec.env_id, str) and length is not None:
         given["max_episode_steps"] = -1  # ours replaces Gymnasium's limit
-    one = functools.partial(_maker(spec), **given)
+    one = functools.partial(adapted, _maker(spec), draws, **given)
     shared: dict[str, Any] = {"sim_params": draws, "episode_length": length}
     if step_timeout_s is None:
         return SequentialVectorEnv([one] * num_envs, **shared)

@@ -15,7 +15,7 @@ from headway.config import Config, override
 from headway.data import Trajectory
 from headway.errors import BadEnvironmentError, HeadwayError, did_you_mean, one_line
 from headway.models.compilation import prepare_jax
-from headway.task import EnvSpec, Task, register
+from headway.task import EnvSpec, Task, name_spec
 from headway.training.collect import Environments, Episode, random_policy, run_episodes
 from headway.training.methods import make_config
 
@@ -58,10 +58,7 @@ def check(env: str | EnvSpec) -> list[Finding]:
         ConfigError: The EnvSpec has the name of a built-in environment.
     """
     prepare_jax()
-    if isinstance(env, EnvSpec):
-        register(env)
-        env = env.name
-    return list(findings(make_config(env)))
+    return list(findings(make_config(name_spec(env))))
 
 
 def refuse_faults(config: Config) -> None:

@@ -10,7 +10,14 @@ from typing import Any
 
 from headway.config import TOLERANCE, Config, known_settings, override
 from headway.errors import ConfigError, unknown_name
-from headway.task import EnvSpec, env_options, env_spec, sim_param_sets
+from headway.task import (
+    BUILT_IN,
+    EnvSpec,
+    env_options,
+    env_spec,
+    episode_length,
+    sim_param_sets,
+)
 
 Settings = Mapping[str, Any]
 """Values by dotted name."""
@@ -200,6 +207,7 @@ def _quick(spec: EnvSpec) -> Settings:
         **SMALL_SEARCH,
         "evaluation.every": 5,
         "evaluation.num_episodes": 8,
+        **({} if spec.name in BUILT_IN else {"collection.min_steps": 1000}),
         **spec.quick,
     }
 
@@ -304,7 +312,26 @@ def make_config(
     config = override(config, {**chosen.settings, **chosen.by_preset.get(preset, {})})
     config = override(config, {"seed": seed, **(settings or {})})
     env_options(config)  # refuses unknown ones
+    if not episode_length(config):
+        config = override(config, {"collection.episode_length": _time_limit(spec)})
     return config
+
+
+def _time_limit(spec: EnvSpec) -> int:
+    """Steps after which Gymnasium cuts an episode of an environment."""
+    from headway.envs.built_in import registered
+    from headway.training.collect import raising
+
+    limit = None
+    if isinstance(spec.env_id, str):
+        with raising(spec.name, "creation"):
+            limit = registered(spec.env_id).max_episode_steps
+    if limit is None:
+        raise ConfigError(
+            f"environment {spec.name!r} has episode_length 0, and Gymnasium knows no time limit of"
+            " it, allowed: at least 1, there or as collection.episode_length."
+        )
+    return limit
 
 
 def config_to_evaluate(

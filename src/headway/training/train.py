@@ -23,7 +23,6 @@ from headway.training.collect import (
     Batches,
     Environments,
     Episode,
-    Policy,
     Rollout,
     agent_policy,
     random_policy,
@@ -42,6 +41,8 @@ EXPLODED = 100.0
 """A loss has exploded when it is above the iteration's best by this many times its size, or 1."""
 SLOWER = 0.25
 """Factor on the step size with every roll-back."""
+FEW_BATCHES = 4
+"""With fewer in all of its data a run is told that they are too few."""
 MANY_MAPS = 30_000
 """Half of the memory maps that Linux allows a process."""
 
@@ -128,10 +129,11 @@ class _Training:
             collected: list[Trajectory] = []
             seconds = {}
             if config.model.learns:
-                rollout = self.collect(collect_key)
-                collected, seconds["collect"] = list(rollout.episodes.values()), rollout.seconds
+                rounds = self.collect(collect_key)
+                collected = [one for rollout in rounds for one in rollout.episodes.values()]
+                seconds["collect"] = sum(rollout.seconds for rollout in rounds)
                 self.data += collected
-                failures = {"planner_failures": rollout.use.failures}
+                failures = {"planner_failures": sum(rollout.use.failures for rollout in rounds)}
                 metrics["collection"] = _summary(collected) | failures
                 metrics["fitting"], seconds["fit"] = self.fit(fit_key)
             tests = self.evaluate(test_key)
@@ -185,30 +187,40 @@ class _Training:
         self.progress.advance(steps)
         self.stop.answer()
 
-    def collect(self, key: PRNGKeyArray) -> Rollout:
-        """Run one episode in each environment, under physics drawn from the training set."""
-        environments, count = self.environments, self.config.collection.num_episodes
-        self.begin_phase("collect", count * environments.episode_length)
-        rng = np.random.default_rng([self.config.seed, self.iteration])
-        seeds = rng.integers(2**31 - 1, size=count)
-        episodes = [Episode(environments.sim_params.sample(rng), int(seed)) for seed in seeds]
+    def collect(self, key: PRNGKeyArray) -> list[Rollout]:
+        """Run rounds of one episode in each environment, until there are `min_steps`.
 
-        def policy() -> Policy:
-            if self.iteration == 0:
-                return random_policy(environments, rng)
-            agent = self.trainer.agent(self.state, self.data)
-            return agent_policy(agent, count, episodes, key=key)
-
-        batches = self.batches("collection")
-        rollout = batches.run("collect", episodes, policy)
-        if not rollout.episodes:
+        Physics come from the training set; those of an environment of your own are dealt evenly.
+        """
+        environments, collection = self.environments, self.config.collection
+        own, sets = self.config.env not in BUILT_IN, environments.sim_params
+        count, agent = collection.num_episodes, None
+        batches, rounds, steps = self.batches("collection"), [], 0
+        self.begin_phase("collect", max(count * environments.episode_length, collection.min_steps))
+        while not rounds or steps < collection.min_steps:
+            number = (len(rounds),) if rounds else ()  # the first one is all of the paper's
+            rng = np.random.default_rng([self.config.seed, self.iteration, *number])
+            seeds = rng.integers(2**31 - 1, size=count)
+            physics = sets.deal(rng, count) if own else [sets.sample(rng) for _ in seeds]
+            episodes = [Episode(*one) for one in zip(physics, map(int, seeds), strict=True)]
+            if self.iteration > 0:
+                agent = agent or self.trainer.agent(self.state, self.data)
+                round_key = jax.random.fold_in(key, *number) if number else key
+                policy = partial(agent_policy, agent, count, episodes, key=round_key)
+            else:
+                policy = partial(random_policy, environments, rng)
+            rollout = batches.run("-".join(["collect", *map(str, number)]), episodes, policy)
+            rounds.append(rollout)
+            steps += sum(map(len, rollout.episodes.values()))
+        taken = [one for rollout in rounds for one in rollout.episodes.values()]
+        if not taken:
             raise batches.too_many()
-        if self.config.collection.check and self.config.env not in BUILT_IN:
-            for found in compared(environments.task, list(rollout.episodes.values())):
+        if collection.check and own:
+            for found in compared(environments.task, taken):
                 if found.text:  # random actions did not come where it shows
                     where = f"{self.config.env}, iteration {self.iteration}, {found.name}: "
                     warnings.warn(where + found.text, stacklevel=1)
-        return rollout
+        return rounds
 
     def batches(self, phase: Literal["collection", "evaluation"]) -> Batches:
         """Run the episodes of a phase."""
@@ -283,6 +295,14 @@ class _Training:
             "rollbacks": rollbacks,
             "transitions": sum(map(len, self.data)),
         }
+        batches, size = int(history[-1].updates), self.config.fitting.batch_size
+        if batches < FEW_BATCHES:
+            warnings.warn(
+                f"{self.config.env}, iteration {iteration}: {measured['transitions']} transitions"
+                f" make {batches} batches (fitting.batch_size {size}), too few to learn from; where"
+                " episodes end early, raise collection.min_steps, the steps per iteration.",
+                stacklevel=1,
+            )
         return measured, seconds + time.perf_counter() - started
 
     def evaluate(self, key: PRNGKeyArray) -> Tests:

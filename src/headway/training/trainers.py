@@ -178,10 +178,18 @@ class Fitted(Trainer):
         return TrainState(FitState.new(net), identity)
 
     def pad(self, trajectories: list[Trajectory]) -> Episodes:
-        """Lay all data out, padded to their size at the end of the run: compiled once."""
-        collection = self.config.collection
+        """Lay all data out, padded to their size at the end of the run: compiled once.
+
+        With `collection.min_steps` nobody knows how many episodes there will be, nor how long;
+        then sizes double when they must.
+        """
+        collection, length = self.config.collection, episode_length(self.config)
         capacity = max(collection.num_iterations * collection.num_episodes, len(trajectories))
-        return Episodes.pad(trajectories, capacity, episode_length(self.config), self.names)
+        if collection.min_steps:
+            longest = max(map(len, trajectories))
+            length = min(length, max(64, 2 ** (longest - 1).bit_length()))
+            capacity = max(capacity, 2 ** (len(trajectories) - 1).bit_length())
+        return Episodes.pad(trajectories, capacity, length, self.names)
 
     def epoch(self, iteration: int, key: PRNGKeyArray) -> tuple[Callable, Any, Any]:
         """A pass over the data, and the keys of bootstrap samples and of shuffles.
@@ -194,12 +202,15 @@ class Fitted(Trainer):
         """Renew the normalisers, collate what an epoch reads, and go through it again and again."""
         one_epoch, data_key, epoch_key = self.epoch(iteration, key)
         model, fitting, fit = self.config.model, self.config.fitting, state.fit
-        episodes = self.pad(trajectories)
+        episodes, collection = self.pad(trajectories), self.config.collection
+        # A round begins while steps are too few, so it may bring as many as it can once more.
+        most = collection.num_episodes * episode_length(self.config) + collection.min_steps
+        most = max(collection.num_iterations * most, sum(map(len, trajectories)))
         statistics = Statistics.fit(self.task, trajectories, self.history_length, self.names)
         samples = Samples.table(
             [len(trajectory) for trajectory in trajectories],
             fitting.future_length,
-            capacity=episodes.action[..., 0].size * fitting.future_length,
+            capacity=most * fitting.future_length,
             drop_first=fitting.drop_first_anchor,
         )
         data = make_data(
