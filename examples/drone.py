@@ -40,10 +40,11 @@ class HoverTask(headway.Task):
         return jnp.abs(next_obs[..., 0]) > 5
 
 
-sim_params = {"train": {"mass": [0.5, 1.0, 1.5]}, "unseen": {"heavy": {"mass": [2.0]}}}
+spec = headway.EnvSpec(
+    env_id=Drone,
+    make_task=HoverTask,
+    sim_params=headway.SimParamSets({"mass": (0.5, 1.0, 1.5)}, {"heavy": {"mass": (2.0,)}}),
+    episode_length=100,
+)
 if __name__ == "__main__":
-    settings = {"collection.episode_length": 100}
-    run = headway.train(
-        Drone, task=HoverTask(), sim_params=sim_params, preset="quick", settings=settings
-    )
-    print(run)
+    print(headway.train(spec, preset="quick"))

@@ -175,7 +175,7 @@ class EnvSpec:
 
     def __post_init__(self) -> None:
         made = self.env_id if isinstance(self.env_id, str) else getattr(self.env_id, "__name__", "")
-        object.__setattr__(self, "name", self.name or made.strip("<>"))
+        object.__setattr__(self, "name", self.name or made.rpartition(":")[2].strip("<>"))
         default = self.default_sim_params
         known = not default or set(default) >= set(self.sim_params.names)
         if not (self.name and self.episode_length >= 0 and self.epochs >= 1 and known):
@@ -244,10 +244,10 @@ def name_spec(env: Any) -> str:
         raise ConfigError(
             f"env is {shown(env)}, allowed: a name, an EnvSpec, or with task=... what makes it."
         )
-    for module in list(sys.modules.values()):
+    for name, module in list(sys.modules.items()):
         for key, value in list(getattr(module, "__dict__", {}).items()):
-            if value is env and module.__name__ != "__main__":
-                return f"{module.__name__}:{key}"
+            if value is env and name != "__main__":
+                return f"{name}:{key}"
     register(env)
     return env.name
 

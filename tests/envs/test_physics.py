@@ -1,7 +1,5 @@
 """Physics by name for MuJoCo environments, and observations that are flattened."""
 
-import copy
-
 import gymnasium
 import mujoco
 import numpy as np
@@ -174,14 +172,6 @@ def test_observations_become_one_row_and_the_physics_of_others_are_not_touched(s
     assert info["sim_params"] == {"mass": 7.0}
     assert not isinstance(env, MujocoPhysics)
     assert isinstance(MujocoPhysics(env), gymnasium.Env)  # a user may ask for it
-
-
-def test_copies_of_an_environment_do_not_share_physics():
-    one, two = walker(), walker()
-    one.reset(options={"sim_params": {"gravity": 0.5}})
-    two.reset()
-    assert one.unwrapped.model.opt.gravity[2] == two.unwrapped.model.opt.gravity[2] / 2
-    assert copy.copy(one.unwrapped.model).opt.gravity[2] != two.unwrapped.model.opt.gravity[2]
 
 
 def test_dm_control_has_the_same_names_and_restores_its_physics():

@@ -114,18 +114,15 @@ def test_an_episode_is_cut_where_gymnasium_cuts_it_by_default():
     assert headway.make_config("Reacher-v5").collection.episode_length == 50
 
 
-def config(method="tmcl", **settings):
+def config(**settings):
     named = {name: value for name, value in runs.TINY.items() if not name.startswith("model")}
     named |= {"collection.episode_length": 20, "collection.check": False, **settings}
-    return headway.make_config(f"{__name__}:SPEC", method=method, preset="smoke", settings=named)
+    return headway.make_config(f"{__name__}:SPEC", preset="smoke", settings=named)
 
 
-@pytest.mark.parametrize("method", ["tmcl", "grbal", "rebal"])
-def test_short_episodes_make_more_of_them_wherever_the_run_is_stopped(
-    method, tmp_path, monkeypatch
-):
+def test_short_episodes_make_more_of_them_wherever_the_run_is_stopped(tmp_path, monkeypatch):
     """Two episodes of 6 steps a round, so 30 steps are three rounds; physics alternate."""
-    wanted = config(method, **{"collection.min_steps": 30, "collection.num_iterations": 2})
+    wanted = config(**{"collection.min_steps": 30, "collection.num_iterations": 2})
     run = train_run(wanted, tmp_path / "run")
     assert [row["collection"]["episodes"] for row in run.metrics()] == [6, 6]
     assert [row["timesteps"] for row in run.metrics()] == [36, 72]
@@ -138,17 +135,15 @@ def test_short_episodes_make_more_of_them_wherever_the_run_is_stopped(
     def interrupted(self, name, *given):
         save(self, name, *given)
         saved.append(name)
-        if saved.count(name) == 1:
+        if name in ("collect-1", "fit") and saved.count(name) == 1:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(run_module.Partial, "save", interrupted)
-    for _ in range(99):
-        try:
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
             train_run(wanted, tmp_path / "stopped")
-            break
-        except KeyboardInterrupt:
-            pass
-    assert {"collect", "collect-1", "collect-2", "fit"} <= {*saved}
+    train_run(wanted, tmp_path / "stopped")
+    assert saved.count("collect") == saved.count("collect-1") == 2  # once an iteration
     assert runs.result(tmp_path / "stopped") == runs.result(tmp_path / "run")
 
 

@@ -197,6 +197,7 @@ def _released_code(spec: EnvSpec) -> Settings:
 
 
 def _quick(spec: EnvSpec) -> Settings:
+    full = 5 * (spec.episode_length or 200)  # steps of five episodes that do not end early
     return {
         "model.hidden_sizes": (128, 128, 128, 128),
         "collection.num_iterations": 5,
@@ -207,7 +208,7 @@ def _quick(spec: EnvSpec) -> Settings:
         **SMALL_SEARCH,
         "evaluation.every": 5,
         "evaluation.num_episodes": 8,
-        **({} if spec.name in BUILT_IN else {"collection.min_steps": 1000}),
+        "collection.min_steps": 0 if spec.name in BUILT_IN else min(1000, full),
         **spec.quick,
     }
 
