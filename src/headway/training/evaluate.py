@@ -19,7 +19,7 @@ from headway.models.compilation import prepare_jax
 from headway.planning.agent import Agent
 from headway.planning.rollouts import plan_flop
 from headway.sim_params import SimParamSets
-from headway.task import Task, sim_param_sets
+from headway.task import Task, env_spec, sim_param_sets
 from headway.training.collect import Batches, Environments, Episode, PlannerUse, agent_policy
 from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
@@ -241,12 +241,16 @@ def evaluate(
     number = run.kept_iteration(iteration)
     tested = [row.group for row in run.evaluation() if row.iteration == number]
     if sim_params:
-        sets = sim_param_sets(config)
+        sets, usual = sim_param_sets(config), env_spec(config.env).default_sim_params
+        told = config.model.context == "sim-params"  # of them, no more and no less
         for name in sim_params:
-            if name not in sets.names:
-                raise ConfigError(str(unknown_name("sim_param", name, sets.names)))
-        custom = {**sets.train, **{name: np.atleast_1d(v) for name, v in sim_params.items()}}
-        physics = {"train": sets.train, "unseen": {**sets.unseen, CUSTOM: custom}}
+            if name not in (allowed := sets.names if told else usual):
+                raise ConfigError(str(unknown_name("sim_param", name, allowed)))
+        added = {name: [usual[name]] for name in sim_params if name not in sets.names}
+        known = {**sets.train, **added}
+        custom = known | {name: np.atleast_1d(v) for name, v in sim_params.items()}
+        unseen = {group: known | values for group, values in sets.unseen.items()}
+        physics = {"train": known, "unseen": {**unseen, CUSTOM: custom}}
         config, groups = override(config, {"sim_params": physics}), [*(groups or ()), CUSTOM]
     with closing(Environments.make(config)) as environments, progress or Progress() as shown:
         agent = load_agent(run, config, environments, number)
