@@ -249,7 +249,7 @@ def evaluate(
         added = {name: [usual[name]] for name in sim_params if name not in sets.names}
         known = {**sets.train, **added}
         custom = known | {name: np.atleast_1d(v) for name, v in sim_params.items()}
-        unseen = {group: known | values for group, values in sets.unseen.items()}
+        unseen = {group: {**known, **values} for group, values in sets.unseen.items()}
         physics = {"train": known, "unseen": {**unseen, CUSTOM: custom}}
         config, groups = override(config, {"sim_params": physics}), [*(groups or ()), CUSTOM]
     with closing(Environments.make(config)) as environments, progress or Progress() as shown:
