@@ -1,6 +1,7 @@
 """Train and load. Importing this, and loading a controller, bring in no simulator."""
 
 import dataclasses
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from headway.sim_params import SimParamSets
 from headway.task import EnvSpec, Task, name_spec
 from headway.training.evaluate import returns_in_words
 from headway.training.methods import config_to_evaluate, make_config
-from headway.training.progress import Progress
+from headway.training.progress import Progress, make_progress
 from headway.training.run import EpisodeRow, Iteration, RunDir
 from headway.training.train import OnIteration, train_run
 from headway.training.trainers import load_agent
@@ -79,7 +80,8 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
         seed: Makes the run repeatable.
         run_dir: Where everything is written; `runs/ENV-METHOD-PRESET-seedSEED` by default.
         settings: Changes by dotted name, for example `{"planner.horizon": 20}`.
-        progress: Shown while training; silent by default.
+        progress: Shown while training; by default a bar on a terminal, lines in a notebook, and
+            nothing elsewhere.
         resume_from_last_good: Where a file of the run is damaged, go back to the newest
             iteration whose files are all intact.
         on_iteration: Called with each iteration's line of `metrics.jsonl` (a dict) once it is
@@ -111,6 +113,8 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
     config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
     name = f"{config.env}-{method}-{preset}-seed{seed}".replace(":", "-").replace("/", "-")
     path = run_dir or Path("runs") / name
+    watched = sys.stderr.isatty() or "ipykernel" in sys.modules
+    progress = progress or make_progress(quiet=not watched)
     run = train_run(
         config, path, progress, on_iteration, resume_from_last_good=resume_from_last_good
     )
