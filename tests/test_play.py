@@ -33,8 +33,10 @@ class Lamp(gymnasium.Env):
     action_space = gymnasium.spaces.Box(-1, 1, (PointTask.action_size,), np.float32)
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
 
-    def __init__(self, render_mode=None, drawn=True, fragile=False):
-        self.drawn, self.fragile, self.steps = drawn and render_mode, fragile, 0
+    fragile = False
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -51,7 +53,7 @@ class Lamp(gymnasium.Env):
         return self.observe(), 0.0, self.steps == 6, False, {}
 
     def render(self):
-        return np.full((60, 80, 3), 200, np.uint8) if self.drawn else None
+        return np.full((60, 80, 3), 200, np.uint8) if self.render_mode else None
 
 
 class DimmableLamp(Lamp):
@@ -61,11 +63,11 @@ class DimmableLamp(Lamp):
         self.power = values["power"]
 
 
-def lamp(tmp_path, monkeypatch, cls=Lamp, **options):
+def lamp(tmp_path, monkeypatch, cls=Lamp):
     """A run with a lamp that acts at random."""
     monkeypatch.setattr(task, "_registered", dict(task._registered))
     power = SimParamSets({"power": Uniform(1, 2)}, {"weak": {"power": [0.5]}})
-    headway.register(EnvSpec("lamp", cls, PointTask, power, 6, {"power": 1.0}, options))
+    headway.register(EnvSpec("lamp", cls, PointTask, power, 6, {"power": 1.0}))
     settings = {"collection.check": False, "collection.num_iterations": 1}
     run = headway.train(
         "lamp", method="random", preset="smoke", run_dir=tmp_path / "run", settings=settings
@@ -186,7 +188,8 @@ def test_an_own_environment_changes_at_once_or_begins_again(tmp_path, monkeypatc
 
 
 def test_an_episode_that_breaks_is_said_and_begun_again(tmp_path, monkeypatch):
-    player = Player(lamp(tmp_path, monkeypatch, fragile=True))
+    player = Player(lamp(tmp_path, monkeypatch))
+    monkeypatch.setattr(Lamp, "fragile", True)
     for _ in range(3):
         player.step()
     assert player.message == "lamp broke: blown"
@@ -194,7 +197,7 @@ def test_an_episode_that_breaks_is_said_and_begun_again(tmp_path, monkeypatch):
 
 
 def test_what_cannot_be_played_is_one_line(tmp_path, monkeypatch, capsys):
-    assert main(["play", str(tmp_path)]) == 1
+    assert main(["play", str(tmp_path / "nothing")]) == 1
     assert "allowed: a run directory" in capsys.readouterr().err
     with pytest.raises(ConfigError, match=r"host is 'nowhere\.invalid' .*, allowed: an address"):
         play(host="nowhere.invalid")
@@ -244,7 +247,7 @@ def browser():
 )
 def test_the_page_shows_and_changes_what_is_played(browser, served):
     player, tab, errors = served.player, browser.new_page(), []
-    tab.set_default_timeout(60_000)
+    tab.set_default_timeout(30_000)
     tab.on("console", lambda line: errors.append(line.text) if line.type == "error" else None)
     tab.on("pageerror", lambda error: errors.append(str(error)))
     tab.on("request", lambda asked: errors.append(asked.url) if alien(asked.url) else None)
@@ -267,7 +270,7 @@ def test_the_page_shows_and_changes_what_is_played(browser, served):
     tab.get_by_role("button", name="step").click()
     wait_until(lambda: len(player.moments) != count)
     assert tab.locator("canvas").first.is_visible()
-    if player.spec.name == "shipped":
+    if player.spec.name == "pendulum":
         assert tab.locator(".heads rect").count() > 5
     tab.close()
     assert not errors
