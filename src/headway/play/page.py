@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import math
 import os
 import socket
@@ -132,6 +133,9 @@ class Page:
             for control in (self._optimizer, self._learn):
                 control.on_update(lambda _: player.ask(self._switch))
         self._scene = _scene(self.server, player)
+        # Without a GPU a browser would stand still for half a minute to light the scene.
+        self.server.scene.configure_environment_map(None)
+        self.server.scene.configure_default_lights(cast_shadow=False)
 
     def _control(self, name: str, values: tuple[float, ...] | Uniform) -> None:
         """A slider for an amount, a choice for a kind."""
@@ -208,15 +212,21 @@ class Page:
 
     def _heads(self) -> str:
         """A strip per network, coloured by its chosen head; a line where physics changed."""
-        moments, parts, rows = list(self.player.moments), [], 0
-        for at, moment in enumerate(moments, REMEMBERED - len(moments)):
-            for row, head in enumerate(() if moment.heads is None else moment.heads):
-                rows, color = max(rows, row + 1), HEADS[int(head) % len(HEADS)]
-                parts.append(f'<rect x="{at}" y="{10 * row}" fill="{color}"/>')
+        moments, parts = list(self.player.moments), []
+        first = REMEMBERED - len(moments)
+        members = list(zip(*(m.heads for m in moments if m.heads is not None), strict=True))
+        for row, heads in enumerate(members):
+            at = first
+            for head, same in itertools.groupby(heads):
+                long, color = len(list(same)), HEADS[int(head) % len(HEADS)]
+                parts.append(f'<rect x="{at}" y="{10 * row}" width="{long}" fill="{color}"/>')
+                at += long
+        for at, moment in enumerate(moments, first):
             if moment.changed:
-                parts.append(f'<rect x="{at}" y="0" style="height: 100%"/>')
+                parts.append(f'<rect x="{at}" width="1" style="height: 100%"/>')
+        rows = len(members)
         return (
-            "<style>.heads rect { width: 1.1px; height: 7px }</style>"
+            "<style>.heads rect { height: 7px }</style>"
             '<div style="padding: 0 0.6em"><small>head that each network plans with</small>'
             f'<svg class="heads" viewBox="0 0 {REMEMBERED} {10 * rows}" preserveAspectRatio="none"'
             f' shape-rendering="crispEdges" style="width: 100%; height: {16 * rows}px">'
