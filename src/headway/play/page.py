@@ -133,9 +133,6 @@ class Page:
             for control in (self._optimizer, self._learn):
                 control.on_update(lambda _: player.ask(self._switch))
         self._scene = _scene(self.server, player)
-        # Without a GPU a browser would stand still for half a minute to light the scene.
-        self.server.scene.configure_environment_map(None)
-        self.server.scene.configure_default_lights(cast_shadow=False)
 
     def _control(self, name: str, values: tuple[float, ...] | Uniform) -> None:
         """A slider for an amount, a choice for a kind."""
@@ -167,7 +164,7 @@ class Page:
 
     def _plot(self, *names: str) -> Any:
         """A plot of lines over the last steps, in seconds from now."""
-        looks = zip(names, ({"stroke": "#8fa3b8", "width": 4}, {"stroke": "#d55e00"}), strict=False)
+        looks = zip(names, ({"stroke": "#8fa3b8", "width": 3}, {"stroke": "#d55e00"}), strict=False)
         series = ({"label": "s"}, *({"label": name} | look for name, look in looks))
         data = tuple(np.zeros(2) for _ in series)
         scales, height = {"x": {"time": False}}, 210 if len(names) > 1 else 130
@@ -255,9 +252,14 @@ def _scene(server: Any, player: Player) -> Show:
     return show
 
 
-def _look(server: Any, distance: float, height: float = 0.0) -> None:
-    server.initial_camera.position = (0.0, -distance, height)
+def _flat(server: Any, distance: float) -> Any:
+    """A scene seen from the front, with lights that a browser without a GPU can draw."""
+    server.initial_camera.position = (0.0, -distance, 0.0)
     server.initial_camera.look_at = (0.0, 0.0, 0.0)
+    server.scene.configure_environment_map(None)
+    server.scene.configure_default_lights(cast_shadow=False)
+    server.scene.add_light_ambient("/light", intensity=2.0)
+    return server.scene
 
 
 def _turned(angle: float) -> tuple[float, float, float, float]:
@@ -266,8 +268,7 @@ def _turned(angle: float) -> tuple[float, float, float, float]:
 
 
 def _pendulum(server: Any) -> Show:
-    scene, depth = server.scene, 0.12
-    _look(server, 4.5)
+    scene, depth = _flat(server, 4.5), 0.12
     scene.add_box("/mount", color=INK, dimensions=(0.06, 0.3, 0.06))
     arm = scene.add_frame("/arm", show_axes=False)
     rod = scene.add_box("/arm/rod", color=BODY, dimensions=(depth, depth, 1.0))
@@ -286,8 +287,7 @@ def _pendulum(server: Any) -> Show:
 
 
 def _cart_pole(server: Any) -> Show:
-    scene, length = server.scene, CartPoleSwingUp.pole_length
-    _look(server, 5.0)
+    scene, length = _flat(server, 5.0), CartPoleSwingUp.pole_length
     scene.add_box("/track", color=(205, 208, 206), dimensions=(4.8, 0.05, 0.02))
     cart = scene.add_box("/cart", color=CART, dimensions=(0.4, 0.2, 0.2))
     pole = scene.add_frame("/pole", show_axes=False)
@@ -308,7 +308,8 @@ def _robot(server: Any, player: Player) -> Show:
     from mjviser import ViserMujocoScene
 
     (model,), (data,) = player.env.models, player.env.datas
-    _look(server, 1.3 * player.env.world.camera[0], 0.5)
+    server.initial_camera.position = (0.0, -player.env.world.camera[0], 0.4)
+    server.initial_camera.look_at = (0.0, 0.0, 0.0)
     robot, looks = ViserMujocoScene(server, model, num_envs=1), model.geom_rgba.copy()
 
     def show(player: Player) -> None:
