@@ -19,8 +19,9 @@ CONSTRAINED_PYTHONS ?= python3.11 python3.12
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' Makefile | awk -F'|' '{ printf "make %-14s %s\n", $$1, $$2 }'
 
-demo: $(VENV)/main.stamp ## Train and evaluate T-MCL on Pendulum, in minutes
-	@$(BIN)/headway train pendulum --preset quick --seed 0 --run-dir runs/demo
+demo: $(VENV)/main.stamp ## Play with a trained pendulum while T-MCL trains on Pendulum, in minutes
+	@$(BIN)/headway play & trap "kill $$! 2>/dev/null" EXIT; \
+		$(BIN)/headway train pendulum --preset quick --seed 0 --run-dir runs/demo
 
 test: $(VENV)/test.stamp ## Run the tests; JOBS=4 runs four at a time
 	@$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder -m "not slow"
@@ -58,7 +59,7 @@ constraints: ## Rewrite constraints.txt from fresh installs of the newest versio
 	@for python in $(CONSTRAINED_PYTHONS); do \
 		venv=$(VENV)-constraints/$$(basename $$python) && rm -rf $$venv && echo "$$python: installing" && \
 		$$python -m venv $$venv && $$venv/bin/python -m pip install -qq --upgrade pip && \
-		$$venv/bin/python -m pip install -qq '.[lab]' --group test --group bench --group lint --group docs && \
+		$$venv/bin/python -m pip install -qq '.[lab,play]' --group test --group bench --group lint --group docs && \
 		$$venv/bin/python -m pip freeze --all --exclude headway --exclude setuptools \
 			| LC_ALL=C sort > $$venv.txt || exit 1; \
 	done
@@ -82,7 +83,7 @@ $(VENV)/main.stamp: $(SPECS)
 		% sys.version_info[:2])'
 	@test -x $(BIN)/pip || { echo "Creating $(VENV)"; $(PYTHON) -m venv $(VENV); }
 	@echo "Installing headway into $(VENV)"
-	@$(INSTALL) --editable '.[lab]'
+	@$(INSTALL) --editable '.[lab,play]'
 	@touch $@
 
 # A pip of 2025 or newer, because only that knows dependency groups.

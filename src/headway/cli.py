@@ -352,6 +352,30 @@ class Record(_OfRun):
 
 
 @dataclasses.dataclass(frozen=True)
+class Play(Command):
+    """Watch a trained controller live in the browser, and change its physics while it acts."""
+
+    run_dir: Annotated[
+        Path | None,
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="[RUN]"),
+        _unless_given("a pendulum that ships with Headway"),
+    ] = None
+    """The run directory."""
+    host: str = "127.0.0.1"
+    """The address to listen at; 0.0.0.0 lets everybody on the network watch and disturb."""
+    port: int = 8080
+    """The port, or the next one that is free."""
+
+    def run(self, words):
+        """Play until Ctrl-C."""
+        from headway.play.page import play
+
+        play(self.run_dir, host=self.host, port=self.port)
+        return 0
+
+
+@dataclasses.dataclass(frozen=True)
 class Diagnose(_OfRun):
     """Measure how well a trained run selects heads, and how well it knows its own error.
 
@@ -637,6 +661,7 @@ COMMANDS: dict[str, type[Command]] = {
     "train": Train,
     "evaluate": Evaluate,
     "record": Record,
+    "play": Play,
     "diagnose": Diagnose,
     "report": Report,
     "reproduce": Reproduce,

@@ -66,16 +66,6 @@ class WorldVectorEnv(HeadwayVectorEnv):
         """Simulator parameters of environment `i` now in force."""
         return {name: float(values[i]) for name, values in self._sim_params.items()}
 
-    def set_sim_params(self, i: int, values: Mapping[str, Any]) -> None:
-        """Change some simulator parameters of environment `i`, and leave its state as it is.
-
-        Raises:
-            ConfigError: A parameter or value is not allowed.
-        """
-        checked = self.world.check(values)
-        self._note(i, checked)
-        self._change(i, checked)
-
     def set_state(self, i: int, state: np.ndarray) -> None:
         """Bring environment `i` to a state that `get_state` returned.
 

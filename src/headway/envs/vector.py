@@ -154,6 +154,16 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """The simulator parameters now in force, one value per environment."""
         return {name: values.copy() for name, values in self._sim_params.items()}
 
+    def set_sim_params(self, i: int, values: Mapping[str, Any]) -> None:
+        """Change some simulator parameters of environment `i`, and leave its state as it is.
+
+        Raises:
+            ConfigError: A parameter or value is not allowed.
+        """
+        checked = self._check_sim_params(dict(values))
+        self._note(i, checked)
+        self._change(i, checked)
+
     def _result(self) -> tuple[np.ndarray, dict[str, Any]]:
         """Observations, NaN where an episode broke, which is cut, and infos."""
         obs, info = self.observe(), {"sim_params": self.sim_params}

@@ -27,6 +27,7 @@ from headway.lab.tables import COLLECTED, TRAIN, group_label
 from headway.training.files import write_bytes
 from headway.training.methods import METHODS
 from headway.training.run import parse_sim_params
+from headway.worlds.rendering import HEADS
 
 STYLE = matplotlib.rc_params_from_file(
     Path(__file__).with_name("headway.mplstyle"), use_default_template=False
@@ -34,7 +35,6 @@ STYLE = matplotlib.rc_params_from_file(
 INK, FAINT, RULE = STYLE["text.color"], STYLE["xtick.color"], STYLE["grid.color"]
 GROUND = "#f4f4f4"
 LABELS = ("#0072b2", "#d55e00", "#009e73", "#b0578d", "#c98a00", "#3f3f46", "#4aa3d6", "#8a7a00")
-HEADS = ("#0173b3", "#e69f00", "#019f74", "#cc79a7", "#56b4e9", "#d65f01", "#f0e442", "#999999")
 MARKERS, DASHES = "osD^vPX*", ("-", "--", ":")
 THEME = {
     **{"ink": INK, "faint": FAINT, "rule": RULE, "axis": STYLE["axes.edgecolor"]},

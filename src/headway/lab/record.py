@@ -119,13 +119,7 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
             action = controller.act(obs[0])
             with raising(config.env, f"step {step}"):
                 obs, reward, terminated, truncated, info = env.step(np.asarray(action)[None])
-                physics, (image,) = _physics(info), env.render()
-                kind = getattr(image, "dtype", type(image).__name__)
-                if kind != np.uint8 or image.ndim != 3:
-                    raise BadEnvironmentError(
-                        f"render() gave {kind}, allowed: an image of type uint8 and shape"
-                        " [height, width, 3], as with render_mode='rgb_array'."
-                    )
+                physics, image = _physics(info), made.frame()
             moments.append(Moment(image, physics, float(reward[0]), controller.heads))
             shown.advance()
             if terminated[0] or truncated[0]:

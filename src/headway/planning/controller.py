@@ -10,11 +10,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from headway.errors import ConfigError, PlanningError, shown
-from headway.planning.agent import Agent, Decision, open_loop
+from headway.models.compilation import jit_networks
+from headway.planning.agent import Agent, AgentState, Decision, open_loop
+from headway.planning.rollouts import follow
 from headway.task import env_action, scaled_action
 
 REMEMBERED = 32
@@ -202,6 +204,16 @@ class Controller:
         """
         return self._heads
 
+    def imagine(self) -> Float[np.ndarray, "member horizon obs"] | None:
+        """Observations that each member expects along the last plan, without noise.
+
+        The first one is its prediction of the next observation. None where there is no new plan:
+        before the first action, while a plan is held, and where the agent makes none.
+        """
+        if self.agent.model is None or self._status is None or self._status.outcome == "held":
+            return None
+        return jax.device_get(_imagine(self.agent, self._state))[:, 0]
+
     @property
     def _num_iterations(self) -> int:
         return 1 if self.agent.model is None else self.agent.planner.num_iterations
@@ -320,6 +332,14 @@ class Controller:
             f" training, allowed: {self._max_deviations:g}"
             for i in np.flatnonzero(~(off <= allowed))
         )
+
+
+@jit_networks
+def _imagine(agent: Agent, state: AgentState) -> Float[Array, "member env horizon obs"]:
+    assert agent.model is not None
+    plan = jnp.concatenate([state.action[:, None], state.search.nominal[:, :-1]], axis=1)
+    dynamics = agent.model.dynamics(state.belief, agent.planner.precision)
+    return follow(dynamics, state.obs, agent.task.project_action(plan))
 
 
 def _row(name: str, given: Any, shape: tuple[int, ...], advice: str) -> Float[np.ndarray, "..."]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Float, Int, PRNGKeyArray, UInt8
 
 from headway.config import LARGEST, Config, differences
 from headway.data import Trajectory
@@ -81,6 +81,21 @@ class Environments:
             vector.close()
             raise
         return cls(config.env, task, vector, sim_params, episode_length(config))
+
+    def frame(self) -> UInt8[np.ndarray, "height width 3"]:
+        """Draw the first environment.
+
+        Raises:
+            BadEnvironmentError: It gave no picture.
+        """
+        image: Any = next(iter(self.vector.render() or ()), None)
+        kind = getattr(image, "dtype", type(image).__name__)
+        if kind != np.uint8 or image.ndim != 3:
+            raise BadEnvironmentError(
+                f"render() gave {kind}, allowed: an image of type uint8 and shape"
+                " [height, width, 3], as with render_mode='rgb_array'."
+            )
+        return image
 
     def close(self) -> None:
         """Free what the environments hold, and end their processes."""

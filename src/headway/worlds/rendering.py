@@ -22,6 +22,8 @@ ZOOM = 122 * SCALE  # pixels drawn per metre
 
 PAPER, GRID, INK = (250, 250, 247), (226, 228, 226), (60, 66, 74)
 CART, BODY, FORCE = (52, 101, 164), (204, 121, 60), (196, 60, 60)
+HEADS = ("#0173b3", "#e69f00", "#019f74", "#cc79a7", "#56b4e9", "#d65f01", "#f0e442", "#999999")
+"""Colours of prediction heads, here and in figures."""
 
 Point = tuple[float, float]
 

@@ -1,0 +1,1 @@
+"""A trained controller to watch and to disturb, live in the browser."""
