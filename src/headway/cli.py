@@ -394,8 +394,7 @@ class Export(_OfRun):
         from headway.service.export import export
 
         path = export(self.run_dir, self.output, iteration=self.iteration, settings=settings)
-        size = path.stat().st_size
-        return self.show({"file": str(path), "bytes": size}, f"{path}: {size / 1e6:.2g} MB")
+        return self.show({"file": str(path)}, f"{path}: {path.stat().st_size / 1e6:.2g} MB")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -37,12 +37,8 @@ class FakeHub:
         (self.folder / name).mkdir(parents=True, exist_ok=True)
         (self.folder / name / ".gitattributes").touch()
 
-    def upload_folder(self, *, repo_id, folder_path, commit_message, delete_patterns):
+    def upload_folder(self, *, repo_id, folder_path, commit_message):
         assert commit_message == "tmcl on pendulum, seed 0"
-        for path in huggingface_hub.utils.filter_repo_objects(
-            self.list_repo_files(repo_id), allow_patterns=delete_patterns
-        ):
-            (self.folder / repo_id / path).unlink()
         shutil.copytree(folder_path, self.folder / repo_id, dirs_exist_ok=True)
 
 
@@ -77,16 +73,26 @@ def test_what_is_pulled_is_the_run_that_was_pushed(data, target, reference, tmp_
     assert "planner.horizon: 4 -> 3" in card.text
 
 
-def test_a_run_that_went_on_replaces_itself(two_iterations, reference, target, tmp_path):
-    """The older iteration goes."""
+def test_a_run_that_went_on_is_brought_up_to_date_and_never_set_back(
+    two_iterations, reference, target, tmp_path
+):
     shorter = shutil.copytree(two_iterations, tmp_path / "shorter")
     RunDir(shorter)._lengthen(2)
     headway.push(shorter, target)
-    headway.pull(target, tmp_path / "pulled")
-    assert RunDir(tmp_path / "pulled").finished_iterations == 2
+    pulled = headway.pull(target, tmp_path / "pulled")
+    assert RunDir(pulled).finished_iterations == 2
     headway.push(reference, target)
-    assert RunDir(headway.pull(target, tmp_path / "pulled")).finished_iterations == 3
-    assert [path.stem for path in (tmp_path / "pulled/checkpoints").iterdir()] == ["iteration-002"]
+    headway.pull(target, pulled)
+    assert RunDir(pulled).finished_iterations == 3
+    refused("a later state of it", headway.push, shorter, target)
+    complete = result(shutil.copytree(reference, tmp_path / "own"))
+    for take, *places in (
+        (headway.pull, target, tmp_path / "own"),
+        (headway.push, *2 * [tmp_path / "own"]),
+    ):
+        take(*places)  # data and older iterations stay
+        (tmp_path / "own/README.md").unlink()
+        assert result(tmp_path / "own") == complete
 
 
 def refused(error, function, *args):
@@ -107,7 +113,7 @@ def test_what_is_not_pushed(target, reference, two_iterations, tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(huggingface_hub, "HfApi", FakeHub)
         for taken in (tmp_path / "damaged/data", other.path):
-            refused("holds something else", headway.push, reference, taken)
+            refused("config.json is missing|holds another run", headway.push, reference, taken)
         refused("is a file", headway.push, reference, reference / "config.json")
         shutil.copytree(tmp_path / "damaged/data", tmp_path / "hub/user/data")
         refused("holds no run", headway.push, reference, "hf://user/data")

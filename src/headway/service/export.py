@@ -25,7 +25,7 @@ from headway.models.compilation import compiler_options, prepare_jax
 from headway.planning.agent import Agent, AgentState, open_loop, step
 from headway.service import needs
 from headway.task import env_spec
-from headway.training.files import check_target, write_bytes
+from headway.training.files import check_target, named_leaves, write_bytes
 from headway.training.methods import config_to_evaluate
 from headway.training.run import Iteration, RunDir
 from headway.training.trainers import load_agent
@@ -83,7 +83,7 @@ def export(
         **describe(run, config, robot.agent),
         "platforms": PLATFORMS,
         "compiler_options": {jax.default_backend(): compiler_options(config.planner.precision)},
-        "state": robot.state_names(),
+        "state": [name for name, _ in named_leaves(robot.begin(0, 0))] + ["steps_left"],
         "outcomes": OUTCOMES,
         "sha256": {name: hashlib.sha256(code).hexdigest() for name, code in codes.items()},
     }
@@ -135,14 +135,12 @@ class Robot:
                 "the run acts at random, plans with a simulator or is told the true physics,"
                 " allowed: a run whose model has learned all it knows, such as tmcl or pets."
             )
-        self.agent, spaces = agent, agent.task.spaces
-        self._low, self._high = np.array(spaces.action_low), np.array(spaces.action_high)
-        self._integers = np.issubdtype(spaces.action_dtype, np.integer)
-        self._structure = jax.tree.structure(self._begin(0, 0))
+        self.agent = agent
+        self._structure = jax.tree.structure(self.begin(0, 0))
 
     def start(self, seed: Int[Array, ""], episode: Int[Array, ""]) -> State:
         """The state at the beginning of an episode; the draws of each are its own."""
-        return self._pack(self._begin(seed, episode), jnp.int32(0))
+        return self._pack(self.begin(seed, episode), jnp.int32(0))
 
     def step(self, state: State, obs: Float[Array, " obs"]) -> tuple[State, Array, Array, Array]:
         """The next state, the action in the environment's units, the heads, and the outcome.
@@ -150,10 +148,21 @@ class Robot:
         The outcome is a number of `OUTCOMES`. With none left the action is NaN, or where actions
         are integers means nothing.
         """
-        finite = jnp.isfinite(obs).all()
-        state, scaled, outcome = jax.lax.cond(finite, self._plan, self._hold, state, obs)
-        heads = getattr(self._unpack(state)[0].belief, "heads", jnp.zeros((1, 0), jnp.int32))
-        return state, self._own_units(scaled, outcome == NONE_LEFT), heads[0], outcome
+        before, left = self._unpack(state)
+
+        def plan() -> tuple[AgentState, Array]:
+            after, decision = step(self.agent, before, obs[None])
+            return after, decision.failures[0] >= self.agent.planner.num_iterations
+
+        def hold() -> tuple[AgentState, Array]:
+            return open_loop(self.agent, before), jnp.array(True)
+
+        after, held = jax.lax.cond(jnp.isfinite(obs).all(), plan, hold)
+        outcome = jnp.where(held, jnp.where(left > 0, HELD, NONE_LEFT), PLANNED)
+        left = jnp.where(held, jnp.maximum(left - 1, 0), self.agent.planner.horizon - 1)
+        heads = getattr(after.belief, "heads", jnp.zeros((1, 0), jnp.int32))[0]
+        action = self._own_units(after.action[0], outcome == NONE_LEFT)
+        return self._pack(after, left), action, heads, outcome
 
     def applied(self, state: State, action: Array) -> State:
         """The state after an action that is not the one `step` returned; NaN if it is not known."""
@@ -171,15 +180,8 @@ class Robot:
         action = jax.eval_shape(self.step, state, obs)[1]
         return {"start": (number, number), "step": (state, obs), "applied": (state, action)}
 
-    def state_names(self) -> list[str]:
-        """Names of the arrays of a state."""
-        indices = range(self._structure.num_leaves)
-        state = jax.tree.unflatten(self._structure, indices)
-        paths = jax.tree_util.tree_flatten_with_path(state)[0]
-        names = [jax.tree_util.keystr(path, simple=True, separator=".") for path, _ in paths]
-        return [*names, "steps_left"]
-
-    def _begin(self, seed: Any, episode: Any) -> AgentState:
+    def begin(self, seed: Any, episode: Any) -> AgentState:
+        """The agent's own state at the beginning of an episode."""
         return self.agent.init(1, key=jax.random.fold_in(jax.random.key(seed), episode))
 
     def _pack(self, state: AgentState, left: Array) -> State:
@@ -190,29 +192,14 @@ class Robot:
         found: AgentState = jax.tree.unflatten(self._structure, leaves)
         return found._replace(key=jax.random.wrap_key_data(found.key)), left
 
-    def _plan(self, state: State, obs: Float[Array, " obs"]) -> tuple[State, Array, Array]:
-        before, left = self._unpack(state)
-        after, decision = step(self.agent, before, obs[None])
-        planner = self.agent.planner
-        failed = decision.failures[0] >= planner.num_iterations
-        held = jnp.where(left > 0, HELD, NONE_LEFT)
-        left = jnp.where(failed, jnp.maximum(left - 1, 0), planner.horizon - 1)
-        return self._pack(after, left), decision.action[0], jnp.where(failed, held, PLANNED)
-
-    def _hold(self, state: State, obs: Float[Array, " obs"]) -> tuple[State, Array, Array]:
-        before, left = self._unpack(state)
-        after = open_loop(self.agent, before)
-        state = self._pack(after, jnp.maximum(left - 1, 0))
-        return state, after.action[0], jnp.where(left > 0, HELD, NONE_LEFT)
-
     def _own_units(self, scaled: Float[Array, " scaled"], unknown: Array) -> Array:
         """`env_action` in 32 bits."""
         spaces = self.agent.task.spaces
+        low, high = np.array(spaces.action_low), np.array(spaces.action_high)
         if spaces.action_kind == "box":  # rounded once where the bounds are opposite numbers
-            middle, half = (self._low + self._high) / 2, (self._high - self._low) / 2
-            own = np.float32(middle) + np.float32(half) * scaled
+            own = np.float32((low + high) / 2) + np.float32((high - low) / 2) * scaled
         else:
             own = jnp.rint(self.agent.task.scale_action(scaled))
-        own = jnp.clip(own, np.float32(self._low), np.float32(self._high))
-        own = own.astype(jnp.int32) if self._integers else jnp.where(unknown, jnp.nan, own)
-        return own.reshape(spaces.action_shape)
+        own = jnp.clip(own, np.float32(low), np.float32(high)).reshape(spaces.action_shape)
+        integers = np.issubdtype(spaces.action_dtype, np.integer)
+        return own.astype(jnp.int32) if integers else jnp.where(unknown, jnp.nan, own)

@@ -6,8 +6,8 @@ that the event loop goes on; a session answers one message after the other.
 
 import asyncio
 import contextlib
+import dataclasses
 import hmac
-import ipaddress
 import json
 import logging
 import signal
@@ -28,6 +28,7 @@ from headway.training.trainers import load_agent
 
 LONGEST = 2**16
 """Bytes of a message at most."""
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
 MESSAGES = ({"obs"}, {"obs", "applied_action"}, {"reset"}, {"describe"})
 ALLOWED = (
     '{"obs": [numbers, or null where a sensor is silent]}, perhaps with "applied_action";'
@@ -74,7 +75,7 @@ def serve(  # noqa: PLR0913 (keywords, all with a default)
             f"max_robots is {max_robots}, silence_s {silence_s:g} and port {port}, allowed: at"
             " least 1, more than 0, and 0 to 65535."
         )
-    if not token and not _is_loopback(host):
+    if not token and host not in LOOPBACK:
         raise ConfigError(
             f"host {host!r} can be reached from other machines, allowed: with a token, or"
             " 127.0.0.1; set HEADWAY_TOKEN or --token."
@@ -87,57 +88,51 @@ def serve(  # noqa: PLR0913 (keywords, all with a default)
     controllers = [
         Controller(agent, seed=seed, deadline_ms=deadline_ms) for seed in range(max_robots)
     ]
-    about = {**describe(run, config, agent), "deadline_ms": deadline_ms}
+    limits = {"deadline_ms": deadline_ms, "max_robots": max_robots}
+    about = describe(run, config, agent) | limits
     with ThreadPoolExecutor(max_robots, thread_name_prefix="headway-robot") as threads:
         sessions = Sessions(controllers, about, threads, silence_s, say)
         asyncio.run(_listen(sessions, host, port, token, ready))
 
 
+@dataclasses.dataclass
 class Sessions:
-    """The sessions of all robots.
+    """The sessions of all robots."""
 
-    Args:
-        controllers: One for each robot that may be connected.
-        about: Answer to `{"describe": true}`.
-        threads: Where plans are made.
-        silence_s: Seconds without a message after which a session is closed.
-        say: Called with a line when a robot comes or goes.
-    """
-
-    def __init__(
-        self,
-        controllers: list[Controller],
-        about: Mapping[str, Any],
-        threads: ThreadPoolExecutor,
-        silence_s: float,
-        say: Callable[[str], Any],
-    ):
-        self.about = about
-        self._free, self._total, self._threads = [*controllers], len(controllers), threads
-        self._silence_s, self._say = silence_s, say
+    free: list[Controller]
+    """One for each robot that may still connect."""
+    about: Mapping[str, Any]
+    """Answer to `{"describe": true}`."""
+    threads: ThreadPoolExecutor
+    """Where plans are made."""
+    silence_s: float
+    """Seconds without a message after which a session is closed."""
+    say: Callable[[str], Any]
+    """Called with a line when a robot comes or goes."""
 
     async def session(self, robot: Any) -> None:
         """One robot's, from its connection to its end."""
         from websockets.exceptions import ConnectionClosed
 
-        if not self._free:
-            reason = f"{self._total} robots are connected, allowed: no more; see --max-robots"
+        if not self.free:
+            reason = f"{self.about['max_robots']} robots are connected, allowed: no more"
             await robot.send(json.dumps({"error": reason}))
             await robot.close(1013, reason)
             return
-        controller, name = self._free.pop(), "{}:{}".format(*robot.remote_address[:2])
-        self._say(f"{name} connected")
-        answers, why = 0, "the robot left"
+        controller, name = self.free.pop(), "{}:{}".format(*robot.remote_address[:2])
+        self.say(f"{name} connected")
+        loop, answers, why = asyncio.get_running_loop(), 0, "the robot left"
         try:
-            await self._in_thread(controller.reset)
+            await loop.run_in_executor(self.threads, controller.reset)
             while True:
-                async with asyncio.timeout(self._silence_s):
+                async with asyncio.timeout(self.silence_s):
                     message = await robot.recv()
-                answer = await self._in_thread(answered, controller, message, self.about)
+                args = answered, controller, message, self.about
+                answer = await loop.run_in_executor(self.threads, *args)
                 await robot.send(json.dumps(answer))
                 answers += 1
         except TimeoutError:
-            why = f"no message for {self._silence_s:g} s"
+            why = f"no message for {self.silence_s:g} s"
             await robot.close(1000, why)
         except ConnectionClosed:
             pass
@@ -145,11 +140,8 @@ class Sessions:
             why = f"{type(error).__name__}: {one_line(error, 300)}"
             raise
         finally:
-            self._free.append(controller)
-            self._say(f"{name} ended after {answers} answers: {why}")
-
-    def _in_thread(self, function: Callable, *args: Any) -> Any:
-        return asyncio.get_running_loop().run_in_executor(self._threads, function, *args)
+            self.free.append(controller)
+            self.say(f"{name} ended after {answers} answers: {why}")
 
 
 def answered(
@@ -166,8 +158,7 @@ def answered(
             physics = asked["reset"]
             controller.reset(physics if isinstance(physics, dict) else None)
             return {"reset": True}
-        obs, applied = (_numbers(asked.get(name)) for name in ("obs", "applied_action"))
-        action = controller.act(obs, applied_action=applied)
+        action = controller.act(asked["obs"], applied_action=asked.get("applied_action"))
     except HeadwayError as error:
         return {"error": one_line(error), "type": type(error).__name__}
     except (ValueError, RecursionError) as error:
@@ -182,12 +173,6 @@ def answered(
         **status._asdict(),
         "heads": None if heads is None else heads.tolist(),
     }
-
-
-def _numbers(row: Any) -> Any:
-    """A row whose nulls are NaN."""
-    nan = float("nan")
-    return [nan if number is None else number for number in row] if isinstance(row, list) else row
 
 
 async def _listen(
@@ -232,9 +217,3 @@ async def _listen(
         where, port = host if ":" not in host else f"[{host}]", server.sockets[0].getsockname()[1]
         ready({"url": f"ws://{where}:{port}", "description": sessions.about})
         await stop.wait()
-
-
-def _is_loopback(host: str) -> bool:
-    with contextlib.suppress(ValueError):
-        return ipaddress.ip_address(host).is_loopback
-    return host == "localhost"

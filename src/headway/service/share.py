@@ -16,7 +16,7 @@ import numpy as np
 from headway.config import differences, tolerating_as
 from headway.errors import ConfigError, HeadwayError, RunError, one_line
 from headway.service import needs
-from headway.training.files import make_dir, remove, write_bytes
+from headway.training.files import reading, write_bytes
 from headway.training.methods import METHODS, make_config
 from headway.training.run import RunDir, format_sim_params
 
@@ -31,7 +31,7 @@ def push(run_dir: str | Path, target: str | Path, *, data: bool = False) -> str:
     Args:
         run_dir: The run directory.
         target: A folder, or `hf://user/name` for the Hugging Face Hub, where a new model is
-            private. An earlier push of the same run is replaced.
+            private. An earlier state of the same run there is brought up to date.
         data: Also copy the episodes it was trained on. Without them it cannot be trained further,
             and heads that keep learning while they act cannot be loaded.
 
@@ -53,9 +53,9 @@ def push(run_dir: str | Path, target: str | Path, *, data: bool = False) -> str:
     if config.planner.adaptation != "none" and not data:
         raise ConfigError(f"the heads of {run.path} learn from its data; push it with --data.")
     files = run.files(data=data)
-    with _hub(target, ["config.json"]) as (folder, send):
+    with _hub(target, ["config.json", "checksums/*"]) as (folder, send):
         files[CARD] = _card(run, str(target)).encode()
-        _copy(files, folder, str(target))
+        _copy(run, files, folder, str(target))
         send(f"{config.method} on {config.env}, seed {config.seed}")
     return str(target)
 
@@ -80,41 +80,36 @@ def pull(source: str | Path, run_dir: str | Path) -> Path:
         files = run.files(data=(folder / "data").is_dir())
         with contextlib.suppress(OSError):  # one's own note is no part of the run
             files[CARD] = (folder / CARD).read_bytes()
-        _copy(files, Path(run_dir), str(run_dir))
+        _copy(run, files, Path(run_dir), str(run_dir))
     return Path(run_dir)
 
 
-def _copy(files: dict[str, bytes], folder: Path, name: str) -> None:
-    """Write a run's files; the checksums last, since they make it count.
+def _copy(run: RunDir, files: dict[str, bytes], folder: Path, name: str) -> None:
+    """Write a run's files, the checksums last, since they make it count; nothing is deleted.
 
     Raises:
-        RunError: The folder holds something else.
+        RunError: The folder holds something else, or more of the run.
     """
     if folder.exists() and not folder.is_dir():
         raise RunError(f"{name} is a file, allowed: a folder; choose another.")
     theirs = folder / "config.json"
-    if folder.is_dir() and any(path.name[0] != "." for path in folder.iterdir()):
-        known = _identity(theirs.read_bytes()) if theirs.is_file() else None
-        if known != _identity(files["config.json"]):
+    if folder.exists() and any(path.name[0] != "." for path in folder.iterdir()):
+        with reading(theirs):
+            known = _identity(theirs.read_bytes())
+        later = RunDir(folder).finished_iterations > run.finished_iterations
+        if later or known != _identity(files["config.json"]):
             raise RunError(
-                f"{name} holds something else than this run, allowed: an empty or new folder, or an"
-                " earlier copy of the run; choose another."
+                f"{name} holds another run or a later state of it, allowed: a new folder, or an"
+                " earlier state of the same run."
             )
-    make_dir(folder)
     for path in sorted(files, key=lambda path: path.startswith("checksums/")):
         write_bytes(folder / path, files[path])
-    for old in folder.glob("*/iteration-*"):
-        if old.relative_to(folder).as_posix() not in files:
-            remove(old)
 
 
 def _identity(content: bytes) -> Any:
     """What of a `config.json` stays as a run becomes longer."""
-    try:
-        values = json.loads(content)
-        values["config"]["collection"].pop("num_iterations")
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return content
+    values = json.loads(content)
+    values["config"]["collection"]["num_iterations"] = None
     return values
 
 
@@ -139,10 +134,7 @@ def _hub(target: str | Path, wanted: Sequence[str]) -> Iterator[tuple[Path, Call
 
         def send(message: str) -> None:
             api.create_repo(name, private=True, exist_ok=True)
-            old = ["*/iteration-*"]
-            api.upload_folder(
-                repo_id=name, folder_path=folder, commit_message=message, delete_patterns=old
-            )
+            api.upload_folder(repo_id=name, folder_path=folder, commit_message=message)
 
         try:
             api = HfApi()
@@ -151,7 +143,7 @@ def _hub(target: str | Path, wanted: Sequence[str]) -> Iterator[tuple[Path, Call
                 if names and "config.json" not in names:
                     raise RunError(f"{target} holds no run, allowed: a new name, or that of a run.")
                 api.snapshot_download(name, local_dir=folder, allow_patterns=[*wanted])
-            make_dir(folder)
+            folder.mkdir(exist_ok=True)
             yield folder, send
         except HeadwayError as error:
             raise type(error)(str(error).replace(str(folder), str(target))) from None
