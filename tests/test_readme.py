@@ -80,7 +80,7 @@ class Machine:
 
 @pytest.mark.usefixtures("guide")
 def test_controller_guide(capsys):
-    (service,) = python_blocks("docs/controller.md")
+    service, *_ = python_blocks("docs/controller.md")
     service = service.replace("deadline_ms=80", "deadline_ms=6e4")
     names: dict = {}
     exec(compile(service, "controller.md", "exec"), names)
@@ -96,6 +96,43 @@ def test_controller_guide(capsys):
     told = [line.split()[:2] for line in capsys.readouterr().out.splitlines()]
     held = [["1", "held"], ["2", "held"]]
     assert told == [*held, ["4", "planned"], *([str(step), "held"] for step in (5, 6, 7))]
+
+
+class RosNode:
+    """What the node of docs/controller.md needs of ROS 2."""
+
+    def __init__(self, name):
+        self.sent, self.said = [], []
+        self.create_subscription = self.create_timer = lambda *args: None
+
+    def create_publisher(self, *args):
+        return types.SimpleNamespace(publish=lambda message: self.sent.append(message["data"]))
+
+    def get_logger(self):
+        return types.SimpleNamespace(error=self.said.append)
+
+
+@pytest.mark.usefixtures("guide")
+def test_ros_node(monkeypatch):
+    spun = []
+    parts = {
+        "rclpy": {"init": lambda: None, "spin": spun.append},
+        "rclpy.node": {"Node": RosNode},
+        "sensor_msgs.msg": {"JointState": dict},
+        "std_msgs.msg": {"Float64MultiArray": dict},
+    }
+    for name, part in parts.items():
+        monkeypatch.setitem(sys.modules, name, types.SimpleNamespace(**part))
+    (code,) = [block for block in python_blocks("docs/controller.md") if "rclpy" in block]
+    code = code.replace("deadline_ms=80", "deadline_ms=6e4")
+    exec(compile(code, "controller.md", "exec"), {})
+    (node,) = spun
+    node.see(types.SimpleNamespace(position=[0.5], velocity=[0.0]))
+    for _ in range(5):  # it sees once, holds for three steps, and stops
+        node.act()
+    assert [len(sent) for sent in node.sent] == [1] * 5
+    assert node.sent[4] == [0.0]
+    assert len(node.said) == 1
 
 
 def table_rows(path: str, heading: str) -> list[list[str]]:

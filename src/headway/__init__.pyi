@@ -30,6 +30,10 @@ from .planning.optimizers import CEM as CEM
 from .planning.optimizers import ICEM as ICEM
 from .planning.optimizers import MPPI as MPPI
 from .planning.optimizers import RandomShooting as RandomShooting
+from .service.export import export as export
+from .service.serve import serve as serve
+from .service.share import pull as pull
+from .service.share import push as push
 from .sim_params import SimParamSets as SimParamSets
 from .sim_params import Uniform as Uniform
 from .task import EnvSpec as EnvSpec

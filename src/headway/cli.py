@@ -409,6 +409,107 @@ class Diagnose(_OfRun):
 
 
 @dataclasses.dataclass(frozen=True)
+class Export(_OfRun):
+    """Write a trained run's controller as one file that plans with JAX alone.
+
+    The defaults shown are those of the run named before --help.
+    """
+
+    output: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")] = tyro.MISSING
+    """The file to write, such as controller.headway."""
+    iteration: Iteration = None
+    """The iteration whose model acts, from 0, or `best` by training return."""
+
+    def run(self, words):
+        """Export, and print where the file is."""
+        settings = self.changed(self.config())
+        from headway.service.export import export
+
+        path = export(self.run_dir, self.output, iteration=self.iteration, settings=settings)
+        return self.show({"file": str(path)}, f"{path}: {path.stat().st_size / 1e6:.2g} MB")
+
+
+@dataclasses.dataclass(frozen=True)
+class Serve(_OfRun):
+    """Answer observations with actions over a WebSocket, until Ctrl-C or SIGTERM.
+
+    The defaults shown are those of the run named before --help.
+    """
+
+    deadline_ms: float = 100.0
+    """Milliseconds from an observation to its action."""
+    host: str = "127.0.0.1"
+    """Address to listen on; any but loopback needs a token."""
+    port: int = 8765
+    """Port to listen on; 0 takes a free one."""
+    token: Annotated[str | None, _unless_given("the environment variable HEADWAY_TOKEN")] = None
+    """What clients must show as `Authorization: Bearer TOKEN`."""
+    max_robots: int = 4
+    """Sessions at once, each with a controller of its own."""
+    silence_s: float = 60.0
+    """Seconds without a message after which a session is closed."""
+    iteration: Iteration = None
+    """The iteration whose model acts, from 0, or `best` by training return."""
+
+    def run(self, words):
+        """Serve; print where once robots may connect, and who comes and goes."""
+        settings = self.changed(self.config())
+        from headway.service.serve import serve
+
+        def ready(facts: Mapping[str, Any]) -> None:
+            text = f"{self.run_dir} at {facts['url']}, {self.deadline_ms:g} ms per answer; Ctrl-C"
+            self.show(facts, f"{text} stops.")
+            sys.stdout.flush()
+
+        names = ("deadline_ms", "host", "port", "max_robots", "silence_s", "iteration")
+        serve(
+            self.run_dir,
+            token=self.token or os.environ.get("HEADWAY_TOKEN"),
+            settings=settings,
+            ready=ready,
+            say=self.progress().message,
+            **{name: getattr(self, name) for name in names},
+        )
+        return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Push(Command):
+    """Copy a finished run, with a model card, to a folder or the Hugging Face Hub."""
+
+    run_dir: RunPath = tyro.MISSING
+    """The run directory."""
+    target: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TARGET")] = tyro.MISSING
+    """A folder, or hf://user/name, which becomes a private model."""
+    data: Flag = False
+    """Also the episodes it was trained on; without them it cannot be trained further."""
+
+    def run(self, words):
+        """Push, and print where it is."""
+        from headway.service.share import push
+
+        target = push(self.run_dir, self.target, data=self.data)
+        return self.show({"target": target}, f"headway pull {shlex.quote(target)} DIR")
+
+
+@dataclasses.dataclass(frozen=True)
+class Pull(Command):
+    """Copy a run that was pushed to a folder or the Hugging Face Hub, and check all of it."""
+
+    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = tyro.MISSING
+    """A folder, or hf://user/name."""
+    run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")] = tyro.MISSING
+    """A new directory, or one with an earlier state of the same run."""
+
+    def run(self, words):
+        """Pull, and print where it is."""
+        from headway.service.share import pull
+
+        path = str(pull(self.source, self.run_dir))
+        return self.show({"run_dir": path}, path)
+
+
+@dataclasses.dataclass(frozen=True)
 class Report(Command):
     """Compare runs on one HTML page that needs nothing else: no network, no other file."""
 
@@ -663,6 +764,10 @@ COMMANDS: dict[str, type[Command]] = {
     "record": Record,
     "play": Play,
     "diagnose": Diagnose,
+    "export": Export,
+    "serve": Serve,
+    "push": Push,
+    "pull": Pull,
     "report": Report,
     "reproduce": Reproduce,
     "sweep": Sweep,

@@ -114,6 +114,29 @@ def test_without_time_for_any_iteration_the_last_plan_goes_on_until_it_ends(time
     assert (timed.status.outcome, timed.status.iterations) == ("deadline", 1)
 
 
+def test_a_deadline_in_which_no_iteration_fits_is_said_and_kept_while_a_plan_is_left(
+    clock, monkeypatch
+):
+    iterate, takes = Agent.iterate, 0.3
+
+    def slow(*args):
+        clock.now += takes
+        return iterate(*args)
+
+    monkeypatch.setattr(Agent, "iterate", slow)
+    with pytest.warns(UserWarning, match=r"iteration of the planner takes 300 here: one step in 4"):
+        controller = Controller(toys.make_agent(), deadline_ms=50.0, clock=clock)
+    found = []
+    for _ in range(60):  # longer than any duration is remembered
+        controller.act(OBS)
+        found.append((controller.status.outcome, round(controller.status.seconds, 6)))
+    assert found == 15 * [("deadline", 0.3), *3 * [("held", 0.0)]]
+    takes = 0.01  # the machine is quick again
+    for _ in range(3):
+        controller.act(OBS)
+    assert controller.status.outcome == "planned"
+
+
 SERVICE = [  # what is seen, how many iterations fit, what comes of it, what was applied
     (OBS, 4, "planned"),
     (OBS, 4, "planned", [0.1, 0.2]),

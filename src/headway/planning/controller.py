@@ -2,6 +2,7 @@
 
 import math
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple
@@ -59,8 +60,9 @@ class Controller:
             to the end. Everything that `act` can need is compiled and timed first, while the
             controller is built.
             Where no earlier plan is left, as in the first step, one iteration is made even if
-            it is late. The promise is that of a program in Python: `status.seconds` has what a
-            step took, with any pause of the system.
+            it is late. So a deadline in which no iteration fits, which is warned of, is kept by
+            all steps but one in `planner.horizon`. The promise is that of a program in Python:
+            `status.seconds` has what a step took, with any pause of the system.
         max_deviations: Standard deviations from the mean of the training data at which a feature
             of an observation is reported; None does not look.
         clock: Tells the seconds.
@@ -172,7 +174,7 @@ class Controller:
             action = self._hold()
             self._status = Status("held", reason, (), 0, self._clock() - started)
             return action
-        warnings = self._unlike_training(row)
+        unlike = self._unlike_training(row)
         decision, done = self._search(row, started)
         scaled, heads, failures, _ = jax.device_get(decision)
         self._heads = None if heads is None else heads[0]
@@ -185,7 +187,7 @@ class Controller:
             reason = f"time was up after {done} of {self._num_iterations} iterations"
         self._count_left(held=held, reason=reason)
         outcome = "held" if held else "deadline" if done < self._num_iterations else "planned"
-        self._status = Status(outcome, reason, warnings, done, self._clock() - started)
+        self._status = Status(outcome, reason, unlike, done, self._clock() - started)
         return env_action(task, scaled[0])
 
     @property
@@ -240,9 +242,10 @@ class Controller:
                 break
             plan = self._timed("iterate", plan, done)
             done += 1
-        if done == 0:  # one hiccup is not remembered for long
-            for durations in filter(None, self._durations.values()):
-                durations.remove(max(durations))
+        if done == 0:  # one hiccup is not remembered for long, the quickest call always
+            for durations in self._durations.values():
+                if len(durations) > 1:
+                    durations.remove(max(durations))
         self._state, decision = self._timed("end", plan)
         return decision, done
 
@@ -267,6 +270,16 @@ class Controller:
             for durations in self._durations.values():
                 durations.clear()  # the first times are those of compiling
             self._search(obs, in_time)
+        self._left = 1
+        if self._seconds and not any(self._search(obs, self._clock())[1] for _ in range(3)):
+            least = sum(map(min, self._durations.values()))
+            horizon = self.agent.planner.horizon
+            warnings.warn(
+                f"deadline_ms is {1000 * self._seconds:g}, but an iteration of the planner takes"
+                f" {1000 * least:.4g} here: one step in {horizon} makes a plan and is late, the"
+                " others hold to it without a look; allow more, or choose a cheaper planner.",
+                stacklevel=3,
+            )
 
     def _hold(self) -> np.ndarray | np.integer:
         """The next action of the last plan, without a look (open loop)."""

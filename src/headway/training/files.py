@@ -24,7 +24,7 @@ UNFINISHED = ".writing"  # ends the name of a file that is not complete yet
 
 def tree_arrays(tree: Any) -> Arrays:
     """The arrays of a pytree, named by their place in it."""
-    return {name: np.asarray(leaf) for name, leaf in _named_leaves(tree)}
+    return {name: np.asarray(leaf) for name, leaf in named_leaves(tree)}
 
 
 def tree_from_arrays(template: Tree, arrays: Arrays, path: Path) -> Tree:
@@ -38,7 +38,7 @@ def tree_from_arrays(template: Tree, arrays: Arrays, path: Path) -> Tree:
     Raises:
         RunError: An array is missing, too many, or has another shape or type.
     """
-    wanted = dict(_named_leaves(template))
+    wanted = dict(named_leaves(template))
     if set(wanted) != set(arrays):
         raise RunError(f"{path} holds other arrays than the run's model has; it is not its file.")
     for name, leaf in wanted.items():
@@ -52,7 +52,8 @@ def tree_from_arrays(template: Tree, arrays: Arrays, path: Path) -> Tree:
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
 
 
-def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
+def named_leaves(tree: Any) -> list[tuple[str, Any]]:
+    """The leaves of a pytree, with names by their place in it."""
     flat, _ = jax.tree_util.tree_flatten_with_path(tree)
     return [(jax.tree_util.keystr(path, simple=True, separator="."), leaf) for path, leaf in flat]
 

@@ -73,6 +73,7 @@ _TYPES = {
     **dict.fromkeys(("seed", "iteration", "episode", "length", "member", "head", "step"), int),
     **dict.fromkeys(("return", "share", "error"), float),
 }
+_FILE = re.compile(r"[a-z_]+\.(json|jsonl|csv)|(data|tests|checkpoints)/iteration-\d+\.safetensors")
 _ARRAYS = ("obs", "action", "reward")  # of a trajectory
 _PLAIN = re.compile(r'[^\s"=][^\s=]*')  # names that stand in a table as they are
 _PAIR = re.compile(rf'("(?:\\.|[^"\\])*"|{_PLAIN.pattern})=(\S+)(?:\s+|$)')
@@ -379,6 +380,24 @@ class RunDir:
             ):
                 found.setdefault(group, []).append(episode)
         return found
+
+    def files(self, *, data: bool) -> dict[str, bytes]:
+        """The files of the newest iteration as they were written, by name, for a copy.
+
+        Args:
+            data: Also what was collected; a copy without it cannot be trained further.
+
+        Raises:
+            RunError: One is damaged or gone, or no file that a run has.
+        """
+        newest = self.last_iteration
+        checksums = _name("checksums", newest)
+        names = self._checksums(newest)
+        for name in names:
+            if not _FILE.fullmatch(name):
+                raise RunError(f"{self.path / checksums} names {shown(name)}, no file of a run.")
+        wanted = [name for name in names if data or not name.startswith("data/")]
+        return {**self._read(wanted), checksums: (self.path / checksums).read_bytes()}
 
     def save_iteration(
         self,
