@@ -362,7 +362,9 @@ class RunDir:
     def load_data(self, until: int | None = None) -> list[Trajectory]:
         """All trajectories that were collected up to an iteration, the newest by default."""
         finished = self.finished_iterations if until is None else until + 1
-        return [t for i in range(finished) for t in self.iteration_data(i)]
+        known = self._checksums(self.finished_iterations - 1)  # fits of recordings collect nothing
+        collected = [i for i in range(finished) if _name("data", i) in known]
+        return [t for i in collected for t in self.iteration_data(i)]
 
     def tests(self) -> dict[str, list[Trajectory]]:
         """The test episodes of the newest iteration by group; empty if there were none.
