@@ -145,7 +145,7 @@ def fit(  # noqa: PLR0913 (keywords, all with a default)
     """
     prepare_jax()
     config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
-    log = read_log(data, config, held_out, names)
+    log = read_log(data, config, held_out, names or {})
     run = train_run(log.config, run_dir or f"{_usual_dir(config)}-fit", progress, log=log)
     return Run(run.path, run.config(), run.metrics(), run.evaluation())
 

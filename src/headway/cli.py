@@ -140,9 +140,7 @@ class Train(Command):
     """Makes the run repeatable."""
     run_dir: Annotated[Path | None, _unless_given("runs/ENV-METHOD-PRESET-seedSEED")] = None
     """Directory of the run."""
-    from_run: Annotated[
-        Path | None, tyro.conf.arg(name="from"), _unless_given("a new run")
-    ] = None
+    from_run: Annotated[Path | None, tyro.conf.arg(name="from"), _unless_given("a new run")] = None
     """A finished run, such as one of `headway fit`, whose copy goes on; ENV may be left out."""
     sim_params: Annotated[Path | None, _unless_given("the environment's own")] = None
     """A JSON file with the training and unseen physics."""
@@ -309,7 +307,9 @@ class ExportData(Command):
         from headway.training.recordings import export_data
 
         episodes = export_data(self.run_dir, self.out)
-        text = f"{self.out}: {episodes} episodes; read it with minari.MinariDataset('{self.out}/data')"
+        text = (
+            f"{self.out}: {episodes} episodes; read it with minari.MinariDataset('{self.out}/data')"
+        )
         return self.show({"data_set": str(self.out), "episodes": episodes}, text)
 
 

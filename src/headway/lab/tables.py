@@ -22,8 +22,8 @@ from headway.config import Config, flatten
 from headway.errors import RunError
 from headway.task import env_names, env_spec
 from headway.training.methods import METHODS
+from headway.training.recordings import HELD_OUT, RECORDING
 from headway.training.references import score, score_of
-from headway.training.recordings import RECORDING
 from headway.training.run import EpisodeRow, RunDir, parse_sim_params
 
 REFERENCES = ("random", "true-dynamics")
@@ -384,11 +384,11 @@ def fitted(run_dir: str | Path) -> tuple[dict[str, Any], Table, Table]:
     run = RunDir(run_dir)
     metrics = run.metrics()
     errors, recordings = metrics[-1]["held_out_error"], metrics[0]["recordings"]
-    steps = [step for step in (1, 2, 5, 10, 15, 20, 25, 30) if step <= len(errors)]
-    title = "Error of held-out recordings by imagined step" if errors else "Nothing was held out"
-    accuracy = new_table(title, numbers=list(map(str, steps)))
-    accuracy.add_row(*(f"{errors[step - 1]:.3g}" for step in steps))
-    accuracy.caption = "standard deviations of each observation; 1 is no better than the mean"
+    accuracy = new_table("Error of held-out recordings", numbers=["imagined step", "error"])
+    for step in (1, 2, 5, 10, 15, 20, 25, 30):
+        if step <= len(errors):
+            accuracy.add_row(str(step), f"{errors[step - 1]:.3g}")
+    accuracy.caption = "in standard deviations; 1 is no better than the mean"
     shares = pd.DataFrame(run.assignments(), columns=["iteration", "member", "sim_params", "share"])
     found = []
     for text, own in shares[shares.iteration == metrics[-1]["iteration"]].groupby("sim_params"):
@@ -410,7 +410,9 @@ def fitted(run_dir: str | Path) -> tuple[dict[str, Any], Table, Table]:
         cells = " ".join(map(str, row["heads"])), full_label(row["sim_params"], names) or "–"
         numbers = row["recording"], f"{row['share']:.0%}", row["transitions"], row["pieces"]
         heads.add_row(*cells, row["file"], *map(str, numbers))
-    heads.caption = "share of its segments, mean over members; head numbers of members are unrelated"
+    heads.caption = (
+        "share of its segments, mean over members; head numbers of members are unrelated"
+    )
     if found[MOST_RECORDINGS:]:
         heads.caption += f"; {len(found) - MOST_RECORDINGS} more in assignments.csv"
     out = sum(row["held_out"] for row in recordings)
@@ -440,6 +442,7 @@ def group_label(group: str) -> str:
         TRAIN: "training physics",
         "unseen": "unseen physics",
         COLLECTED: "training physics, while collecting",
+        HELD_OUT: "held-out recordings",
     }
     return names.get(group, f"unseen: {group.replace('_', ' ')}")
 

@@ -621,6 +621,12 @@ def trajectory_arrays(trajectories: Sequence[Trajectory]) -> tuple[Arrays, dict[
     return arrays, {"episodes": episodes}
 
 
+def trajectories_digest(trajectories: Sequence[Trajectory]) -> str:
+    """SHA-256 of all their arrays."""
+    arrays, _ = trajectory_arrays(trajectories)
+    return hashlib.sha256(b"".join(array.tobytes() for array in arrays.values())).hexdigest()
+
+
 def trajectories_from(arrays: Arrays, facts: Mapping[str, Any]) -> list[Trajectory]:
     """Build what `trajectory_arrays` took apart."""
     return [
