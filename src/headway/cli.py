@@ -281,7 +281,7 @@ class Fit(Train):
             run_dir=self.run_dir,
             settings=settings,
             held_out=self.held_out,
-            names=dict(word.split("=", 1) for word in self.names if "=" in word),
+            names={name: text for name, _, text in (w.partition("=") for w in self.names)},
             progress=self.progress(),
         )
         drawn = [str(path) for path in figures.save_run_figures(run.path)]
@@ -307,10 +307,8 @@ class ExportData(Command):
         from headway.training.recordings import export_data
 
         episodes = export_data(self.run_dir, self.out)
-        text = (
-            f"{self.out}: {episodes} episodes; read it with minari.MinariDataset('{self.out}/data')"
-        )
-        return self.show({"data_set": str(self.out), "episodes": episodes}, text)
+        facts = {"data_set": str(self.out), "episodes": episodes}
+        return self.show(facts, f"{self.out}: {episodes} episodes")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Recordings: what is read of them, where they are cut, what is refused, and runs made of them."""
 
 import json
+from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +11,7 @@ from pyarrow import parquet
 
 import headway
 import runs
+from headway import task
 from headway.cli import main
 from headway.errors import ConfigError, HeadwayError
 from headway.training import recordings
@@ -101,9 +103,9 @@ def test_cuts_are_said_and_rewards_that_are_missing_are_the_tasks():
     log = read([changed(obs=with_nan([10]), reward=reward)])
     assert log.remarks[0] == "cut at 1 rows with missing numbers: 1 recordings, 2 pieces."
     assert log.remarks[1].startswith("reward: Task.reward is ")
-    (piece, _), task = log.fitted, headway.env_spec("pendulum").make_task()
+    (piece, _), law = log.fitted, headway.env_spec("pendulum").make_task()
     obs, action = jnp.asarray(piece.obs), jnp.asarray(piece.action)
-    due = task.reward(obs[:-1], 2 * action, obs[1:])
+    due = law.reward(obs[:-1], 2 * action, obs[1:])
     np.testing.assert_allclose(piece.reward[[0, 3, 8]], [due[0], -7, due[8]], rtol=1e-5)
 
 
@@ -172,6 +174,34 @@ def test_recordings_are_held_out_whole():
     assert [row["held_out"] for row in log.recordings].count(True) == 3
     alone = read([recording(90)], held_out=0.3)
     assert (len(alone.fitted), len(alone.held_out)) == (2, 1)
+
+
+class Push(headway.Task):
+    """A machine of which there is no environment, so that its Task states all."""
+
+    obs_size: ClassVar[int] = 1
+    action_size: ClassVar[int] = 1
+    action_low: ClassVar[tuple[float, ...]] = (-1.0,)
+    action_high: ClassVar[tuple[float, ...]] = (1.0,)
+
+    def reward(self, obs, action, next_obs):
+        return -jnp.square(next_obs[..., 0])
+
+
+def no_environment(**options):
+    raise RuntimeError("there is none")
+
+
+def test_a_task_is_enough_where_no_environment_can_be_made(monkeypatch):
+    monkeypatch.setattr(task, "_registered", {})
+    sets = headway.SimParamSets({"mass": [1.0]})
+    headway.register(headway.EnvSpec("push", no_environment, Push, sets, 50, {"mass": 1.0}))
+    log = read(
+        [{"x": np.arange(9.0), "u": np.zeros(9)}], names={"obs": "x", "action": "u"}, env="push"
+    )
+    assert lengths(log) == [8]
+    assert log.config.spaces.obs_size == 1
+    np.testing.assert_allclose(log.fitted[0].reward, -(np.arange(1, 9.0) ** 2))
 
 
 @pytest.fixture(scope="module")

@@ -69,6 +69,9 @@ def read_log(data: Data, config: Config, held_out: float, names: Mapping[str, st
             f"held_out is {held_out} and the method {config.method}, allowed: a share from 0 to"
             " below 1, and a method that learns."
         )
+    for name in names:
+        if name not in ALIASES:
+            raise unknown_name("name of what a recording holds", name, ALIASES)
     task = _task(config)
     for found in method_findings(task):
         if found.status == "fault":
@@ -299,8 +302,10 @@ class _Cutter:
             other |= period <= 0
             usual = np.median(period[period > 0]) if (period > 0).any() else np.nan
             gap = ~other & ~(np.abs(period / usual - 1) <= JITTER)
-        flags = (np.nan_to_num(recording.column(n, rows)) for n in ("terminated", "truncated"))
-        terminated, truncated = (values[:-1] != 0 for values in flags)
+        terminated, truncated = (
+            np.nan_to_num(recording.column(name, rows))[:-1].astype(bool)
+            for name in ("terminated", "truncated")
+        )
         ends = terminated | truncated
         known, taken = np.isfinite(obs).all(1), np.isfinite(action).all(1)
         self.gaps += int(gap.sum())
