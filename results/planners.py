@@ -17,9 +17,8 @@ import numpy as np
 
 from headway.config import override
 from headway.models.compilation import prepare_jax
-from headway.planning.rollouts import plan_flop
 from headway.training.collect import Environments, agent_policy, random_policy, run_episodes
-from headway.training.evaluate import group_episodes
+from headway.training.evaluate import PlanningCost, group_episodes
 from headway.training.run import RunDir, format_sim_params
 from headway.training.trainers import load_agent
 
@@ -81,15 +80,13 @@ def episodes_of(run: RunDir, name: str, asked: argparse.Namespace) -> list[dict[
         else:
             policy = agent_policy(agent, len(episodes), episodes, key=jax.random.key(asked.seed))
         rollout = run_episodes(environments, episodes, policy)
-    use = rollout.use
-    candidates = use.evaluations / use.steps
+    used, planner = PlanningCost.of(rollout.use, config, environments.task), config.planner
     cost = {
         "network_evaluations_per_step": round(
-            candidates * config.planner.num_particles * config.planner.horizon
+            used.evaluations_per_step * planner.num_particles * planner.horizon
         ),
-        "gflop_per_step": plan_flop(config.model, config.planner, environments.task, candidates)
-        / 1e9,
-        "seconds_per_step": use.seconds / use.timed_steps,
+        "gflop_per_step": used.flop_per_step / 1e9,
+        "seconds_per_step": used.seconds_per_step,
     }
     return [
         {

@@ -173,9 +173,14 @@ def test_physics_from_a_file(capsys, tmp_path):
 
 def test_help_shows_the_values_that_settings_would_have(capsys, trained):
     for words in (["train", "pendulum", "--preset", "quick"], ["evaluate", trained]):
-        code, out, err = run(capsys, *words, "--help")
-        assert (code, err) == (0, "")
-        assert "--planner.horizon INT Imagined steps. (default: 20)" in without_boxes(out)
+        lengths = []
+        for option in ("--help", "--help-all"):
+            code, out, err = run(capsys, *words, option)
+            assert (code, err) == (0, "")
+            assert "--planner.horizon INT Imagined steps. (default: 20)" in without_boxes(out)
+            assert ("--planner.selection-length" in out) == (option == "--help-all")
+            lengths.append(len(out))
+        assert lengths[0] < lengths[1] / 2
     for command in COMMANDS:
         assert run(capsys, command, "--help")[0] == 0
 

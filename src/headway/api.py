@@ -1,6 +1,7 @@
 """Train and load. Importing this, and loading a controller, bring in no simulator."""
 
 import dataclasses
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from headway.planning.controller import Controller
 from headway.task import env_spec
 from headway.training.evaluate import returns_in_words
 from headway.training.methods import config_to_evaluate, make_config
-from headway.training.progress import Progress
+from headway.training.progress import Progress, make_progress
 from headway.training.recordings import Data, read_log
 from headway.training.run import EpisodeRow, Iteration, RunDir
 from headway.training.train import OnIteration, continued, copy_run, train_run
@@ -75,7 +76,8 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
         from_run: A finished run, such as one of `fit`, whose copy goes on for as many iterations
             again, or up to `collection.num_iterations`; method, preset and seed are its own.
         settings: Changes by dotted name, for example `{"planner.horizon": 20}`.
-        progress: Shown while training; silent by default.
+        progress: Shown while training; by default a bar on a terminal, lines in a notebook, and
+            nothing elsewhere.
         resume_from_last_good: Where a file of the run is damaged, go back to the newest
             iteration whose files are all intact.
         on_iteration: Called with each iteration's line of `metrics.jsonl` (a dict) once it is
@@ -101,7 +103,7 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
             raise ConfigError(f"env is {env!r}, allowed: {config.env!r}, that of {from_run}.")
         copy_run(Path(from_run), path)
     run = train_run(
-        config, path, progress, on_iteration, resume_from_last_good=resume_from_last_good
+        config, path, _watched(progress), on_iteration, resume_from_last_good=resume_from_last_good
     )
     return Run(run.path, run.config(), run.metrics(), run.evaluation())
 
@@ -137,7 +139,7 @@ def fit(  # noqa: PLR0913 (keywords, all with a default)
         held_out: Share of the recordings on which errors are measured and nothing is fitted.
         names: What arrays are called where that is not guessed, several of them with commas:
             `{"obs": "angle,speed", "action": "torque"}`.
-        progress: Shown while fitting; silent by default.
+        progress: As in `train`.
 
     Raises:
         ConfigError: A recording cannot be read, or does not fit the environment.
@@ -146,8 +148,13 @@ def fit(  # noqa: PLR0913 (keywords, all with a default)
     prepare_jax()
     config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
     log = read_log(data, config, held_out, names or {})
-    run = train_run(log.config, run_dir or f"{_usual_dir(config)}-fit", progress, log=log)
+    run = train_run(log.config, run_dir or f"{_usual_dir(config)}-fit", _watched(progress), log=log)
     return Run(run.path, run.config(), run.metrics(), run.evaluation())
+
+
+def _watched(progress: Progress | None) -> Progress:
+    watched = sys.stderr.isatty() or "ipykernel" in sys.modules
+    return progress or make_progress(quiet=not watched)
 
 
 def _usual_dir(config: Config) -> Path:

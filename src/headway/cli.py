@@ -5,6 +5,8 @@ Headway's, 2 wrong usage, 130 interrupted, 143 terminated.
 """
 
 import dataclasses
+import functools
+import inspect
 import io
 import json
 import os
@@ -13,7 +15,7 @@ import shlex
 import sys
 import typing
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -40,6 +42,12 @@ RESUMABLE = ("train", "fit", "reproduce", "sweep")
 TERMINATED = 143  # as a shell reports SIGTERM
 
 SECTIONS = ("model", "fitting", "planner", "collection", "evaluation")
+USUAL = {  # settings that --help shows; --help-all shows all of them
+    "fitting": ("epochs", "precision"),
+    "planner": ("horizon", "num_candidates", "precision", "adaptation", "change_threshold"),
+    "collection": ("num_iterations", "num_episodes", "episode_length"),
+    "evaluation": ("num_episodes", "every"),
+}
 
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
@@ -258,7 +266,6 @@ class Fit(Train):
     names: Annotated[tuple[str, ...], _unless_given("guessed")] = ()
     """What arrays are called, for example obs=angle,speed action=torque."""
     from_run: tyro.conf.Suppress[None] = None
-    evaluation: tyro.conf.Suppress[EvaluationConfig] = EvaluationConfig()
 
     def with_defaults(self, names):
         """Take the settings of task, method and preset."""
@@ -756,7 +763,31 @@ def parse(words: Sequence[str]) -> Command:
     names, _ = tyro.cli(Names, args=rest, add_help=False, return_unknown_args=True)
     named = names.words or names.from_run
     default = command().with_defaults(names) if named else command()
-    return tyro.cli(command, default=default, args=rest, prog=f"headway {words[0]}", config=config)
+    asked = functools.partial(tyro.cli, prog=f"headway {words[0]}", config=config)
+    if {"-h", "--help"} & set(rest) and any(hasattr(default, name) for name in SECTIONS):
+        brief = {
+            name: _with_fields(value, hidden=set(vars(value)) - set(USUAL.get(name, ())))
+            for name, value in vars(default).items()
+            if name in SECTIONS
+        }
+        default = _with_fields(default, replaced=brief)
+        told = f"{inspect.cleandoc(command.__doc__ or '')}\n--help-all shows all settings."
+        return asked(type(default), default=default, args=["--help"], description=told)
+    rest = ["--help" if word == "--help-all" else word for word in rest]
+    return asked(command, default=default, args=rest)
+
+
+def _with_fields(
+    value: Any, hidden: Collection[str] = (), replaced: Mapping[str, Any] | None = None
+) -> Any:
+    """A dataclass instance as tyro shows it, some of its fields hidden and others replaced."""
+    hints = typing.get_type_hints(type(value), include_extras=True)
+    kinds = {name: tyro.conf.Suppress[hints[name]] for name in hidden}
+    kinds |= {name: type(other) for name, other in (replaced or {}).items()}
+    values = vars(value) | dict(replaced or {})
+    fields = [(name, kind, dataclasses.field(default=values[name])) for name, kind in kinds.items()]
+    name, bases = type(value).__name__, (type(value),)
+    return dataclasses.make_dataclass(name, fields, bases=bases, frozen=True)(**values)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

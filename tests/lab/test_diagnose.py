@@ -31,8 +31,11 @@ def test_diagnose_runs_the_tests_of_a_run(reference, capsys):
         assert inside == sorted(inside)
         assert sum(physics["episodes"] for physics in group["physics"]) == 2
     assert files(reference) == before
-    found = lab.facts(headway.diagnose(reference))
-    assert json.loads(json.dumps(found))["groups"] == said["groups"]
+    found = headway.diagnose(reference)
+    assert json.loads(json.dumps(lab.facts(found)))["groups"] == said["groups"]
+    shown = found._repr_mimebundle_([], [])  # by a notebook
+    for mime in ("text/plain", "text/html"):
+        assert "Calibration of the predicted variance" in shown[mime]
 
 
 def test_diagnose_collected_episodes_and_what_is_refused(reference, capsys):

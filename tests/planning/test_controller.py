@@ -71,6 +71,16 @@ def test_a_search_ends_in_time_and_not_earlier_than_need_be(seconds, iterations,
     assert controller.status.outcome == {0: "held", 4: "planned"}.get(iterations, "deadline")
 
 
+def test_a_controller_says_how_its_last_action_was_found(clock):
+    controller = Controller(toys.make_agent(), clock=clock)
+    clock.tick = 0.002
+    start = "Controller(2 numbers in, 2 out; cem, horizon 4"
+    assert repr(controller) == f"{start})"
+    controller.act(OBS)
+    heads = " ".join(map(str, controller.heads))
+    assert repr(controller) == f"{start}; planned in 2 ms, heads {heads})"
+
+
 def test_slow_iterations_are_expected_to_stay_slow_but_a_hiccup_is_forgotten(clock):
     clock.tick = 1.0
     controller = Controller(toys.make_agent(), deadline_ms=9000.0, clock=clock)

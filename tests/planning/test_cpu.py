@@ -57,10 +57,12 @@ def test_cores_that_share_a_plan_choose_the_actions_of_one_program(
     monkeypatch.setattr(cpu, "CACHES_OF_CORE", caches)
     agent = make_agent(**settings)
     plain, timed = Controller(agent), Controller(agent, deadline_ms=1e7)
-    shared, in_time = toys.walk(agent), [timed.act(obs) for obs in OBS]
+    walks = {n: toys.walk(agent, n) for n in (2, 4)}  # shards of candidates, of environments
+    in_time = [timed.act(obs) for obs in OBS]
     assert timed.status.outcome == "planned"
     monkeypatch.setattr(cpu, "LEAST_STEPS", np.inf)
-    np.testing.assert_allclose(shared, toys.walk(agent), atol=1e-5)
+    for num_envs, walk in walks.items():
+        np.testing.assert_allclose(walk, toys.walk(agent, num_envs), atol=1e-5)
     np.testing.assert_allclose(in_time, [plain.act(obs) for obs in OBS], atol=1e-4)
 
 
@@ -94,7 +96,7 @@ def test_shards_do_not_wait_for_threads_that_are_busy(monkeypatch):
     with ThreadPoolExecutor(1) as busy:
         monkeypatch.setattr(cpu, "_threads", lambda: busy)
         busy.submit(free.wait, 60)
-        found = in_shards(lambda shard: jnp.full((1, shard.size), 1.0 * shard.first), 6, 3)
+        found = in_shards(lambda shard: jnp.full((1, shard.size), 1.0 * shard.first), (1, 6), 3)
         assert not free.is_set()
         free.set()
     np.testing.assert_array_equal(np.concatenate(found, 1), [[0, 0, 2, 2, 4, 4]])
@@ -112,7 +114,7 @@ def test_an_error_in_another_thread_is_raised(monkeypatch):
     with ThreadPoolExecutor(1) as threads:
         monkeypatch.setattr(cpu, "_threads", lambda: threads)
         with pytest.raises(ZeroDivisionError):
-            in_shards(fails_elsewhere, 4, 2)
+            in_shards(fails_elsewhere, (1, 4), 2)
 
 
 IN_THREADS = """

@@ -126,9 +126,9 @@ def test_a_single_particle_is_one_members_and_counts_from_the_mean_of_its_fellow
     args = dynamics, toys.POINT, jnp.zeros((1, 2)), jnp.asarray(pushes)
     whole = candidate_returns(*args, planner=planner, key=KEY)
     np.testing.assert_allclose(whole, [[0, 0, -2.2, -18.2, -2.2]], atol=1e-5)
-    ends = [(0, 3), (2, 3)]  # shards overlap, and may begin at any member
+    ends = [(1, 0, 3), (1, 2, 3)]  # shards overlap, and may begin at any member
     parts = [candidate_returns(*args, planner=planner, key=KEY, shard=cpu.Shard(*s)) for s in ends]
-    np.testing.assert_allclose(cpu.joined(parts, 5), whole, rtol=1e-6)
+    np.testing.assert_allclose(cpu.joined(parts, (1, 5)), whole, rtol=1e-6)
     means = -4.4 / 3, -9.1
     own = np.array([0, 0, -2.2, -18.2, -2.2]) - np.array(means)[[0, 1, 0, 1, 0]]
     found = within_members(whole, planner, 2)

@@ -80,6 +80,8 @@ def test_new_draws_are_said_and_physics_need_no_group(reference):
     says = "New draws, not those of iteration 2's tests"
     reasons = ("custom was not tested", "evaluation.num_episodes: 2 -> 1")
     assert heard.said == [f"{says}: {reason}." for reason in reasons]
+    (other,) = headway.evaluate(reference, sim_params={"gain": -1.0}, num_episodes=1)
+    assert (other.group, other.sim_params["gain"]) == ("custom", -1.0)  # no set names it
     with pytest.raises(ConfigError, match=r"unknown sim_param .lenth.. Did you mean .length."):
         headway.evaluate(reference, sim_params={"lenth": 2.0})
 

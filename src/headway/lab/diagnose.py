@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from rich.console import Group
+from rich.jupyter import JupyterMixin
 from rich.table import Table
 
 from headway.config import Config
@@ -24,8 +26,8 @@ from headway.training.trainers import load_agent
 
 
 @dataclasses.dataclass(frozen=True)
-class Diagnosis:
-    """Head selection in a run's test episodes."""
+class Diagnosis(JupyterMixin):
+    """Head selection in a run's test episodes; notebooks and `rich.print` show its tables."""
 
     path: Path
     """The run directory."""
@@ -38,6 +40,10 @@ class Diagnosis:
     def window(self) -> int:
         """Right selections in a row after which selection has settled: as many as it looks at."""
         return self.config.planner.selection_length
+
+    def __rich__(self) -> Group:
+        """The tables that `headway diagnose` prints."""
+        return Group(*tables(self))
 
     def summary(self, group: str) -> selection.SelectionSummary:
         """The averages of a group."""

@@ -148,14 +148,14 @@ class Agent(eqx.Module):
         # Iterations of a kind are one program; which of them it is decides the key alone.
         which = plan.key, np.int32(iteration), iteration * optimizer.unrolled
         candidates, key = _ask(optimizer, self.task, plan.search, *which)
-        total, shards = candidates.shape[1], self._num_shards(len(plan.obs))
 
-        def returns_of(shard: cpu.Shard | None) -> Float[Array, "env shard"]:
+        def returns_of(shard: cpu.Shard | None) -> Float[Array, "shard_env shard_candidate"]:
             args = plan.dynamics, self.task, plan.obs, candidates
             return _score[precision](*args, planner=self.planner, key=key, shard=shard)
 
         if self.model.traceable:
-            returns = cpu.in_shards(returns_of, total, shards)
+            shape, shards = candidates.shape[:2], self._num_shards(len(plan.obs))
+            returns = cpu.in_shards(returns_of, shape, shards)
         else:
             returns = [jnp.asarray(plan.dynamics.returns(candidates))]
         members = getattr(plan.dynamics, "num_members", 1)  # a simulator has none
@@ -235,11 +235,11 @@ def _tell(
     optimizer: Optimizer,
     search: Any,
     candidates: Float[Array, "env candidate horizon action"],
-    returns: list[Float[Array, "env shard"]],
+    returns: list[Float[Array, "shard_env shard_candidate"]],
     planner: PlannerConfig,
     num_members: int,
 ) -> Any:
-    whole = cpu.joined(returns, candidates.shape[1])
+    whole = cpu.joined(returns, candidates.shape[:2])
     return optimizer.tell(search, candidates, within_members(whole, planner, num_members))
 
 

@@ -98,6 +98,17 @@ class Controller:
         self._episode = -1
         self.reset()
 
+    def __repr__(self) -> str:
+        """One line: sizes, planner, and how the last action was found."""
+        task, planner = self.agent.task, self.agent.planner
+        search = f"{planner.optimizer.name}, horizon {planner.horizon}"
+        search, last = search if self.agent.model else "random actions", ""
+        if self._status:
+            last = f"; {self._status.outcome} in {1e3 * self._status.seconds:.3g} ms"
+        if self._heads is not None:
+            last += f", heads {' '.join(map(str, self._heads))}"
+        return f"Controller({task.obs_size} numbers in, {task.action_size} out; {search}{last})"
+
     def reset(self, sim_params: Mapping[str, float] | None = None) -> None:
         """Forget the past; call it when an episode begins or the physics may have changed.
 

@@ -1,9 +1,9 @@
 """Tricks that make plans fast, each measured (docs/performance.md). None changes a result.
 
-On a CPU every core imagines a shard of the candidates in a program of its own: XLA divides every
-operation of one program among threads, which wait for each other before the next operation;
-programs called from several threads run side by side, each in the caches of its core, and meet
-once per iteration of the optimizer.
+On a CPU every core imagines a shard in a program of its own, some of the environments or, where
+they are fewer than cores, some of the candidates: XLA divides every operation of one program among
+threads, which wait for each other before the next operation; programs called from several threads
+run side by side, each in the caches of its core, and meet once per iteration of the optimizer.
 """
 
 import functools
@@ -30,8 +30,10 @@ GPU_ARRAYS = 8
 
 
 class Shard(NamedTuple):
-    """The candidates that one program imagines, with the noise that they have in the whole."""
+    """What one program imagines, with the noise that it has in the whole."""
 
+    axis: int
+    """0: some environments. 1: some candidates of all environments."""
     first: Any
     """Number of the first of them; a value, so that one program serves all shards."""
     size: int
@@ -49,23 +51,28 @@ def num_shards(num_steps: int) -> int:
 
 
 def in_shards(
-    returns_of: Callable[[Shard | None], Float[Array, "env shard"]], total: int, shards: int
-) -> list[Float[Array, "env shard"]]:
+    returns_of: Callable[[Shard | None], Float[Array, "shard_env shard_candidate"]],
+    shape: tuple[int, int],
+    shards: int,
+) -> list[Float[Array, "shard_env shard_candidate"]]:
     """Compute returns in shards of one size, side by side; `joined` puts them together.
 
     JAX's settings that a context manager makes for this thread do not reach the others.
 
     Args:
-        returns_of: Compiled: the returns of some candidates, or of all for None.
-        total: Number of all candidates.
+        returns_of: Compiled: the returns of a shard, or of all for None.
+        shape: Numbers of environments and of candidates.
         shards: Number of shards, at most.
     """
     if shards == 1:
         return [returns_of(None)]
+    axis = 0 if shape[0] >= shards else 1
+    total = shape[axis]
     size = -(-total // shards)
 
     def of_shard(first: int) -> Array:
-        return jax.block_until_ready(returns_of(Shard(np.int32(min(first, total - size)), size)))
+        which = Shard(axis, np.int32(min(first, total - size)), size)
+        return jax.block_until_ready(returns_of(which))
 
     def begin(first: int) -> Future:
         try:
@@ -79,11 +86,15 @@ def in_shards(
     return [here, *(of_shard(i) if future.cancel() else future.result() for i, future in others)]
 
 
-def joined(shards: list[Float[Array, "env shard"]], total: int) -> Float[Array, "env candidate"]:
-    """The returns of all candidates; the last shard may overlap with the one before."""
+def joined(
+    shards: list[Float[Array, "shard_env shard_candidate"]], shape: tuple[int, int]
+) -> Float[Array, "env candidate"]:
+    """The returns of all; the last shard may overlap with the one before."""
     *before, last = shards
-    twice = len(shards) * last.shape[1] - total
-    return jnp.concatenate([*before, last[:, twice:]], axis=1)
+    axis = 0 if last.shape[0] < shape[0] else 1
+    twice = len(shards) * last.shape[axis] - shape[axis]
+    rest = jax.lax.slice_in_dim(last, twice, None, axis=axis)
+    return jnp.concatenate([*before, rest], axis)
 
 
 @functools.cache

@@ -25,7 +25,7 @@ def candidate_returns(
     planner: PlannerConfig,
     key: PRNGKeyArray,
     shard: cpu.Shard | None = None,
-) -> Float[Array, "env shard"]:
+) -> Float[Array, "shard_env shard_candidate"]:
     """Mean return of each candidate over its particles, each staying with one member (TS∞).
 
     A candidate of a single particle is imagined by one member of the ensemble, the next candidate
@@ -43,13 +43,20 @@ def candidate_returns(
         candidates: Action sequences in [-1, 1].
         planner: Particles, their noise, and the reward that counts.
         key: Draws the noise of the rollouts.
-        shard: The candidates whose returns are wanted, if not all.
+        shard: The environments or candidates whose returns are wanted, if not all.
     """
     total, first_candidate = candidates.shape[1], 0
+    keys = jax.vmap(functools.partial(jax.random.fold_in, key))(jnp.arange(len(obs)))
+    args: tuple[Any, Array, Array, PRNGKeyArray] = (dynamics.own, obs, candidates, keys)
     if shard is not None:
-        first_candidate, size = shard
-        candidates = jax.lax.dynamic_slice_in_dim(candidates, first_candidate, size, axis=1)
-    num_envs, num_candidates, horizon, _ = candidates.shape
+        part = {"start_index": shard.first, "slice_size": shard.size}
+        if shard.axis == 0:
+            args = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, **part), args)
+        else:
+            first_candidate = shard.first
+            own_candidates = jax.lax.dynamic_slice_in_dim(candidates, axis=1, **part)
+            args = dynamics.own, obs, own_candidates, keys
+    num_envs, num_candidates, horizon, _ = args[2].shape
     ensemble, obs_size = dynamics.num_members, obs.shape[-1]
     alone = planner.num_particles < ensemble  # each candidate has one member
     particles = 1 if alone else planner.num_particles // ensemble
@@ -102,8 +109,6 @@ def candidate_returns(
 
         return jax.lax.map(of_member, jnp.arange(ensemble)).mean((0, 1))
 
-    keys = jax.vmap(functools.partial(jax.random.fold_in, key))(jnp.arange(num_envs))
-    args: tuple[Any, Array, Array, PRNGKeyArray] = (dynamics.own, obs, candidates, keys)
     at_once = cpu.environments_at_once(num_envs, bytes_per_env, budget)
     if at_once == num_envs:
         return jax.vmap(of_env)(*args)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import jax
 import numpy as np
@@ -19,7 +19,7 @@ from headway.models.compilation import prepare_jax
 from headway.planning.agent import Agent
 from headway.planning.rollouts import plan_flop
 from headway.sim_params import SimParamSets
-from headway.task import sim_param_sets
+from headway.task import Task, env_spec, sim_param_sets
 from headway.training.collect import Batches, Environments, Episode, PlannerUse, agent_policy
 from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
@@ -67,6 +67,16 @@ class PlanningCost:
 
     The first step of each batch is left out, because it may compile.
     """
+
+    @classmethod
+    def of(cls, use: PlannerUse, config: Config, task: Task) -> Self:
+        """Divide what was used by the steps that were planned."""
+        evaluations = use.evaluations / use.steps
+        return cls(
+            evaluations,
+            plan_flop(config.model, config.planner, task, evaluations),
+            use.seconds / use.timed_steps if use.timed_steps else None,
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -231,12 +241,16 @@ def evaluate(
     number = run.kept_iteration(iteration)
     tested = [row.group for row in run.evaluation() if row.iteration == number]
     if sim_params:
-        sets = sim_param_sets(config)
+        sets, usual = sim_param_sets(config), env_spec(config.env).default_sim_params
+        told = config.model.context == "sim-params"  # of them, no more and no less
         for name in sim_params:
-            if name not in sets.names:
-                raise ConfigError(str(unknown_name("sim_param", name, sets.names)))
-        custom = {**sets.train, **{name: np.atleast_1d(v) for name, v in sim_params.items()}}
-        physics = {"train": sets.train, "unseen": {**sets.unseen, CUSTOM: custom}}
+            if name not in (allowed := sets.names if told else usual):
+                raise ConfigError(str(unknown_name("sim_param", name, allowed)))
+        added = {name: [usual[name]] for name in sim_params if name not in sets.names}
+        known = {**sets.train, **added}
+        custom = known | {name: np.atleast_1d(v) for name, v in sim_params.items()}
+        unseen = {group: {**known, **values} for group, values in sets.unseen.items()}
+        physics = {"train": known, "unseen": {**unseen, CUSTOM: custom}}
         config, groups = override(config, {"sim_params": physics}), [*(groups or ()), CUSTOM]
     with closing(Environments.make(config)) as environments, progress or Progress() as shown:
         agent = load_agent(run, config, environments, number)
@@ -249,13 +263,7 @@ def evaluate(
         key = jax.random.key(seed) if changed else iteration_keys(config, number)[2]
         order, begin = list(dict.fromkeys([*tested, *known])), partial(shown.phase, "evaluate")
         tests = run_tests(agent, wanted, order, batches, key, begin)
-    use = tests.use
-    evaluations = use.evaluations / use.steps
-    cost = PlanningCost(
-        evaluations,
-        plan_flop(config.model, config.planner, environments.task, evaluations),
-        use.seconds / use.timed_steps if use.timed_steps else None,
-    )
+    cost = PlanningCost.of(tests.use, config, environments.task)
     rows = tests.rows(config, number)
     return Evaluation(rows, config, cost, tests.trajectories)
 
