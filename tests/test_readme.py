@@ -59,6 +59,13 @@ def test_own_environment_guide(guide):
     assert jnp.isclose(task.reward(obs, jnp.array([1.0]), jnp.array([0.5, 0.1])), -0.26)
 
 
+def test_logged_data_guide(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (code,) = python_blocks("docs/logged-data.md")
+    exec(compile(code, "logged-data.md", "exec"), {})
+    assert capsys.readouterr().out.count(",") == 3  # an error for each step of the horizon
+
+
 class Machine:
     """The machine that docs/controller.md serves: a cart whose sensor fails."""
 

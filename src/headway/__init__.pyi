@@ -1,6 +1,7 @@
 # Public names and their modules, the only list of them; `__init__.py` loads each at its first use.
 
 from .api import Run as Run
+from .api import fit as fit
 from .api import load as load
 from .api import train as train
 from .config import Config as Config
@@ -49,6 +50,7 @@ from .training.methods import PRESETS as PRESETS
 from .training.methods import Method as Method
 from .training.methods import make_config as make_config
 from .training.methods import register_method as register_method
+from .training.recordings import export_data as export_data
 from .training.run import EpisodeRow as EpisodeRow
 from .training.run import RunDir as RunDir
 from .training.trainers import Trainer as Trainer

@@ -6,17 +6,18 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from headway.config import Config
+from headway.config import Config, override
 from headway.errors import ConfigError
 from headway.models.compilation import prepare_jax
 from headway.planning.controller import Controller
 from headway.sim_params import SimParamSets
-from headway.task import EnvSpec, Task, name_spec
+from headway.task import EnvSpec, Task, env_spec, name_spec
 from headway.training.evaluate import returns_in_words
 from headway.training.methods import config_to_evaluate, make_config
 from headway.training.progress import Progress, make_progress
+from headway.training.recordings import Data, read_log
 from headway.training.run import EpisodeRow, Iteration, RunDir
-from headway.training.train import OnIteration, train_run
+from headway.training.train import OnIteration, continued, copy_run, train_run
 from headway.training.trainers import load_agent
 
 
@@ -59,6 +60,7 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
     preset: str = "paper",
     seed: int = 0,
     run_dir: str | Path | None = None,
+    from_run: str | Path | None = None,
     settings: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
     resume_from_last_good: bool = False,
@@ -79,6 +81,8 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
         preset: A name from `headway list presets`.
         seed: Makes the run repeatable.
         run_dir: Where everything is written; `runs/ENV-METHOD-PRESET-seedSEED` by default.
+        from_run: A finished run, such as one of `fit`, whose copy goes on for as many iterations
+            again, or up to `collection.num_iterations`; method, preset and seed are its own.
         settings: Changes by dotted name, for example `{"planner.horizon": 20}`.
         progress: Shown while training; by default a bar on a terminal, lines in a notebook, and
             nothing elsewhere.
@@ -110,15 +114,73 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
     elif sim_params is not None:
         settings = {**(settings or {}), "sim_params": sim_params}
     env = name_spec(env)
-    config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
-    name = f"{config.env}-{method}-{preset}-seed{seed}".replace(":", "-").replace("/", "-")
-    path = run_dir or Path("runs") / name
-    watched = sys.stderr.isatty() or "ipykernel" in sys.modules
-    progress = progress or make_progress(quiet=not watched)
+    if from_run is None:
+        config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
+        path = Path(run_dir or _usual_dir(config))
+    else:
+        config = override(continued(from_run), settings or {})
+        path = Path(run_dir or f"{Path(from_run)}-on")
+        if env_spec(env).name != config.env:
+            raise ConfigError(f"env is {env!r}, allowed: {config.env!r}, that of {from_run}.")
+        copy_run(Path(from_run), path)
     run = train_run(
-        config, path, progress, on_iteration, resume_from_last_good=resume_from_last_good
+        config, path, _watched(progress), on_iteration, resume_from_last_good=resume_from_last_good
     )
     return Run(run.path, run.config(), run.metrics(), run.evaluation())
+
+
+def fit(  # noqa: PLR0913 (keywords, all with a default)
+    data: Data,
+    env: str,
+    *,
+    method: str = "tmcl",
+    preset: str = "paper",
+    seed: int = 0,
+    run_dir: str | Path | None = None,
+    settings: Mapping[str, Any] | None = None,
+    held_out: float = 0.2,
+    names: Mapping[str, str] | None = None,
+    progress: Progress | None = None,
+) -> Run:
+    """Fit a model to recordings alone; no environment is stepped (docs/logged-data.md).
+
+    The run's iterations are rounds of fitting, as many as training has. It can be loaded, tested
+    and diagnosed as any other, and `train(from_run=...)` goes on collecting.
+
+    Args:
+        data: An `.npz` or Parquet file, a folder of them, a Minari data set (its folder, or
+            `"minari:ID"`), or tables in memory: mappings with `obs` [time or time + 1, ...] and
+            `action` [time, ...] in the environment's units.
+        env: Short name or id of the environment whose Task they were recorded for.
+        method: A name from `headway list methods`.
+        preset: A name from `headway list presets`.
+        seed: Makes the run repeatable; also draws what is held out.
+        run_dir: Where everything is written; `runs/ENV-METHOD-PRESET-seedSEED-fit` by default.
+        settings: Changes by dotted name.
+        held_out: Share of the recordings on which errors are measured and nothing is fitted.
+        names: What arrays are called where that is not guessed, several of them with commas:
+            `{"obs": "angle,speed", "action": "torque"}`.
+        progress: As in `train`.
+
+    Raises:
+        ConfigError: A recording cannot be read, or does not fit the environment.
+        RunError: The directory holds something else, is damaged, or in use.
+    """
+    prepare_jax()
+    config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
+    log = read_log(data, config, held_out, names or {})
+    run = train_run(log.config, run_dir or f"{_usual_dir(config)}-fit", _watched(progress), log=log)
+    return Run(run.path, run.config(), run.metrics(), run.evaluation())
+
+
+def _watched(progress: Progress | None) -> Progress:
+    watched = sys.stderr.isatty() or "ipykernel" in sys.modules
+    return progress or make_progress(quiet=not watched)
+
+
+def _usual_dir(config: Config) -> Path:
+    name = f"{config.env}-{config.method}-{config.preset}-seed{config.seed}"
+    return Path("runs") / name.replace(":", "-").replace("/", "-")
 
 
 def load(

@@ -38,7 +38,7 @@ from headway.errors import ConfigError, HeadwayError, one_line
 
 MAX_SEEDS = 1000
 PIPE_WIDTH = 130
-RESUMABLE = ("train", "reproduce", "sweep")
+RESUMABLE = ("train", "fit", "reproduce", "sweep")
 TERMINATED = 143  # as a shell reports SIGTERM
 
 SECTIONS = ("model", "fitting", "planner", "collection", "evaluation")
@@ -72,6 +72,8 @@ class Names:
     method: str = "tmcl"
     preset: str = "paper"
     optimizer: Annotated[str | None, tyro.conf.arg(name="planner.optimizer.name")] = None
+    task: str | None = None
+    from_run: Annotated[Path | None, tyro.conf.arg(name="from")] = None
 
     def settings(self) -> dict[str, str]:
         """Choices among settings that others depend on, by dotted name."""
@@ -146,6 +148,8 @@ class Train(Command):
     """Makes the run repeatable."""
     run_dir: Annotated[Path | None, _unless_given("runs/ENV-METHOD-PRESET-seedSEED")] = None
     """Directory of the run."""
+    from_run: Annotated[Path | None, tyro.conf.arg(name="from"), _unless_given("a new run")] = None
+    """A finished run, such as one of `headway fit`, whose copy goes on; ENV may be left out."""
     sim_params: Annotated[Path | None, _unless_given("the environment's own")] = None
     """A JSON file with the training and unseen physics."""
     env_options: Annotated[tuple[str, ...], _unless_given("those of the preset")] = ()
@@ -160,20 +164,32 @@ class Train(Command):
 
     def with_defaults(self, names):
         """Take the settings of environment, method and preset."""
-        from headway.training.methods import make_config
-
-        config = make_config(
-            names.words[0], method=names.method, preset=names.preset, settings=names.settings()
+        config = self.base(
+            names.words[0] if names.words else "", names.method, names.preset, names.from_run
         )
-        taken = ("method", "preset", *SECTIONS)
+        config = override(config, names.settings())
+        taken = ("method", "preset", *SECTIONS, *["env", "seed"] * bool(names.from_run))
         return dataclasses.replace(self, **{name: getattr(config, name) for name in taken})
+
+    @staticmethod
+    def base(env: str, method: str, preset: str, from_run: Path | None = None) -> Config:
+        """The settings that all changes are made to."""
+        from headway.training.methods import make_config
+        from headway.training.train import continued
+
+        return continued(from_run) if from_run else make_config(env, method=method, preset=preset)
 
     def settings(self) -> dict[str, Any]:
         """Settings by dotted name that differ from those of method and preset."""
-        from headway.training.methods import make_config
-
-        config = make_config(self.env, method=self.method, preset=self.preset)
+        config = self.base(self.env, self.method, self.preset, self.from_run)
         settings = self.changed(config)
+        if self.from_run:
+            for name in ("env", "method", "preset", "seed"):
+                if getattr(self, name) != getattr(config, name):
+                    raise ConfigError(
+                        f"{name} is {getattr(self, name)!r}, allowed with --from:"
+                        f" {getattr(config, name)!r}, that of {self.from_run}; leave it out."
+                    )
         if self.env_options:
             options = dict(config.env_options)
             for word in self.env_options:
@@ -204,6 +220,7 @@ class Train(Command):
             preset=self.preset,
             seed=self.seed,
             run_dir=self.run_dir,
+            from_run=self.from_run,
             settings=settings,
             progress=self.progress(),
             resume_from_last_good=self.resume_from_last_good,
@@ -228,6 +245,77 @@ class Train(Command):
             f"Test it again:\n  {shlex.join(['headway', 'evaluate', str(run.path)])}",
             f"The command, which resumes what was interrupted:\n  {again}",
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit(Train):
+    """Fit a model to recordings alone, and show how well and what its heads are for.
+
+    A recording has `obs` and `action` by row, and perhaps more: see the page on logged data. The
+    defaults shown are those of the environment, method and preset named before --help.
+    """
+
+    data: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")] = tyro.MISSING
+    """An .npz or Parquet file, a folder of them, a Minari data set (its folder, or minari:ID)."""
+    env: Annotated[str, tyro.conf.arg(name="task")] = tyro.MISSING
+    """Short name or id of the environment whose Task they were recorded for."""
+    run_dir: Annotated[Path | None, _unless_given("runs/ENV-METHOD-PRESET-seedSEED-fit")] = None
+    """Directory of the run."""
+    held_out: float = 0.2
+    """Share of the recordings on which errors are measured and nothing is fitted."""
+    names: Annotated[tuple[str, ...], _unless_given("guessed")] = ()
+    """What arrays are called, for example obs=angle,speed action=torque."""
+    from_run: tyro.conf.Suppress[None] = None
+
+    def with_defaults(self, names):
+        """Take the settings of task, method and preset."""
+        if names.task is None:
+            return self
+        return super().with_defaults(dataclasses.replace(names, words=(names.task,)))
+
+    def run(self, words):
+        """Fit, print errors by imagined step and the heads of each recording."""
+        settings = self.settings()
+        from headway import api
+        from headway.lab import figures, tables
+
+        run = api.fit(
+            self.data,
+            self.env,
+            method=self.method,
+            preset=self.preset,
+            seed=self.seed,
+            run_dir=self.run_dir,
+            settings=settings,
+            held_out=self.held_out,
+            names={name: text for name, _, text in (w.partition("=") for w in self.names)},
+            progress=self.progress(),
+        )
+        drawn = [str(path) for path in figures.save_run_figures(run.path)]
+        facts, *shown = tables.fitted(run.path)
+        facts = {"run_dir": str(run.path), **facts, "figures": drawn}
+        go_on = shlex.join(["headway", "train", "--from", str(run.path)])
+        return self.show(
+            facts, *shown, "\n  ".join(["Figures:", *drawn]), f"Go on collecting:\n  {go_on}"
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class ExportData(Command):
+    """Write what a run collected as a Minari data set."""
+
+    run_dir: RunPath = tyro.MISSING
+    """The run directory."""
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")] = tyro.MISSING
+    """The folder to make, with a version at its end, as pendulum-v0."""
+
+    def run(self, words):
+        """Write, and print where it is."""
+        from headway.training.recordings import export_data
+
+        episodes = export_data(self.run_dir, self.out)
+        facts = {"data_set": str(self.out), "episodes": episodes}
+        return self.show(facts, f"{self.out}: {episodes} episodes")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -760,6 +848,8 @@ class PlotDynamics(Command):
 
 COMMANDS: dict[str, type[Command]] = {
     "train": Train,
+    "fit": Fit,
+    "export-data": ExportData,
     "evaluate": Evaluate,
     "record": Record,
     "play": Play,
@@ -801,7 +891,8 @@ def parse(words: Sequence[str]) -> Command:
         return tyro.cli(commands, args=words, prog="headway", description=told, config=config)
     command, rest = COMMANDS[words[0]], words[1:]
     names, _ = tyro.cli(Names, args=rest, add_help=False, return_unknown_args=True)
-    default = command().with_defaults(names) if names.words else command()
+    named = names.words or names.from_run
+    default = command().with_defaults(names) if named else command()
     asked = functools.partial(tyro.cli, prog=f"headway {words[0]}", config=config)
     if {"-h", "--help"} & set(rest) and any(hasattr(default, name) for name in SECTIONS):
         brief = {

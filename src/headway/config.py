@@ -463,6 +463,9 @@ class Config:
     """Training and unseen simulator parameters; None takes the environment's own."""
     spaces: Spaces | None = None
     """Observation and action space; read from the environment when a run begins."""
+    log: Mapping[str, pydantic.JsonValue] | None = None
+    """The recordings that the first iterations (`rounds`) fit; None where all data are collected.
+    """
     model: Annotated[ModelConfig, _tagged(MODELS, "kind")] = MultiHeadedConfig()
     """The dynamics model."""
     fitting: FittingConfig = FittingConfig()

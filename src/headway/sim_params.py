@@ -120,9 +120,12 @@ class SimParamSets:
         return [{name: float(column[i]) for name, column in columns.items()} for i in range(count)]
 
     def nearest(self, sim_params: Mapping[str, float]) -> dict[str, float]:
-        """Return the training physics of `group` that drawn ones are counted with."""
+        """Return the training physics of `group` that drawn ones are counted with.
+
+        What else is there, such as the number of a recording, stays.
+        """
         return {
-            name: min(_column(self.train[name]), key=lambda one: abs(one - value))
+            name: min(_column(self.train.get(name, (value,))), key=lambda one: abs(one - value))
             for name, value in sim_params.items()
         }
 

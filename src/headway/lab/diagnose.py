@@ -20,6 +20,7 @@ from headway.training import selection
 from headway.training.evaluate import evaluate, known_groups
 from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
+from headway.training.recordings import HELD_OUT
 from headway.training.run import RunDir
 from headway.training.trainers import load_agent
 
@@ -104,9 +105,12 @@ def diagnose(
                 "groups or episodes are chosen together with `collected`, allowed: one of them; the"
                 " collected episodes are all of training physics."
             )
-        trajectories = {COLLECTED: run.iteration_data(run.last_iteration)}
+        rounds = int(str((config.log or {}).get("rounds", 0)))
+        fits = run.last_iteration < rounds  # of recordings, all kept with the first iteration
+        trajectories = {COLLECTED: run.iteration_data(0 if fits else run.last_iteration)}
     elif num_episodes is None and (kept := run.tests()):
-        wanted = known_groups(groups, sim_param_sets(config).group_names)
+        own = HELD_OUT in kept and not groups  # a fit's recordings, where it has tested nothing
+        wanted = [HELD_OUT] if own else known_groups(groups, sim_param_sets(config).group_names)
         if kept.keys() >= set(wanted):
             trajectories = {group: kept[group] for group in wanted}
     if not trajectories:

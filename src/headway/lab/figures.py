@@ -418,7 +418,7 @@ def save_run_figures(run_dir: str | Path) -> list[Path]:
             " arbitrary: head 0 of one member has nothing to do with head 0 of another."
         )
         width = max(1.3 * shares.member.nunique() + 0.6, 5.6)
-        size = (width, 0.9 + 0.3 * shares.sim_params.nunique())
+        size = (width, 0.9 + min(0.3 * shares.sim_params.nunique(), 30.0))
         square = {"marker": "s", "markersize": 8, "linestyle": ""}
         looks = {
             f"head {head}": {"color": HEADS[head % len(HEADS)], **square}

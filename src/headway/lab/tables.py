@@ -22,8 +22,9 @@ from headway.config import Config, flatten
 from headway.errors import RunError
 from headway.task import env_names, env_spec
 from headway.training.methods import METHODS
+from headway.training.recordings import HELD_OUT, RECORDING
 from headway.training.references import score, score_of
-from headway.training.run import EpisodeRow, parse_sim_params
+from headway.training.run import EpisodeRow, RunDir, parse_sim_params
 
 REFERENCES = ("random", "true-dynamics")
 TRAIN, COLLECTED = "train", "collected"
@@ -43,8 +44,12 @@ _FILES: dict[str, tuple[str, str, dict[str, type]]] = {  # by table: file, loss 
     }),
 }  # fmt: skip
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError)
-_NO_VARIANT = ("env", "method", "preset", "seed", "collection.max_bad_episodes")
+_NO_VARIANT = (
+    *("env", "method", "preset", "seed", "log", "log.rounds", "log.sha256"),
+    "collection.max_bad_episodes",
+)
 _LONG_LABEL = 60  # letters
+MOST_RECORDINGS = 40  # lines
 
 Physics = Mapping[str, float]
 
@@ -79,9 +84,9 @@ class Runs:
     @property
     def final(self) -> pd.DataFrame:
         """Test episodes after the last iteration of finished runs."""
-        last = self.runs[["run", "planned"]].drop_duplicates().set_index("run")["planned"]
+        last = self.runs[["run", "planned"]].drop_duplicates().set_index("run")["planned"] - 1
         found = self.episodes[self.episodes["run"].isin(self.finished)]
-        return found[found.iteration == found["run"].map(last) - 1]
+        return found[found.iteration == found["run"].map(last)]
 
 
 def read_runs(paths: Iterable[str | Path]) -> Runs:
@@ -370,6 +375,51 @@ def evaluation(
     return facts, table
 
 
+def fitted(run_dir: str | Path) -> tuple[dict[str, Any], Table, Table]:
+    """Summarise a fit of recordings: errors by imagined step, and the heads of each recording.
+
+    Returns:
+        Plain values for JSON, and both tables for a terminal.
+    """
+    run = RunDir(run_dir)
+    metrics = run.metrics()
+    errors, recordings = metrics[-1]["held_out_error"], metrics[0]["recordings"]
+    accuracy = new_table("Error of held-out recordings", numbers=["imagined step", "error"])
+    for step in (1, 2, 5, 10, 15, 20, 25, 30):
+        if step <= len(errors):
+            accuracy.add_row(str(step), f"{errors[step - 1]:.3g}")
+    accuracy.caption = "in standard deviations; 1 is no better than the mean"
+    shares = pd.DataFrame(run.assignments(), columns=["iteration", "member", "sim_params", "share"])
+    found = []
+    for text, own in shares[shares.iteration == metrics[-1]["iteration"]].groupby("sim_params"):
+        physics = parse_sim_params(str(text))
+        number = int(physics.pop(RECORDING))
+        by_head = [member.share.to_numpy() for _, member in own.groupby("member")]
+        best = [int(np.argmax(share)) for share in by_head]
+        share = float(np.mean([share.max() for share in by_head]))
+        about = {"recording": number, "sim_params": physics, **recordings[number]}
+        found.append({**about, "heads": best, "share": share})
+    found.sort(key=lambda row: (row["heads"], row["recording"]))
+    heads = new_table(
+        "Which head of each member explains a recording best",
+        *("heads", "physics", "file"),
+        numbers=("recording", "share", "transitions", "pieces"),
+    )
+    names = varying([row["sim_params"] for row in found])
+    for row in found[:MOST_RECORDINGS]:
+        cells = " ".join(map(str, row["heads"])), full_label(row["sim_params"], names) or "–"
+        numbers = row["recording"], f"{row['share']:.0%}", row["transitions"], row["pieces"]
+        heads.add_row(*cells, row["file"], *map(str, numbers))
+    heads.caption = (
+        "share of its segments, mean over members; head numbers of members are unrelated"
+    )
+    if found[MOST_RECORDINGS:]:
+        heads.caption += f"; {len(found) - MOST_RECORDINGS} more in assignments.csv"
+    out = sum(row["held_out"] for row in recordings)
+    heads.caption += f"; {out} recordings were held out"
+    return {"held_out_error": errors, "recordings": found}, accuracy, heads
+
+
 def new_table(title: str, *texts: str, numbers: Sequence[str] = ()) -> Table:
     """An empty table in the look of all others: columns of texts, then columns of numbers."""
     table = Table(
@@ -392,6 +442,7 @@ def group_label(group: str) -> str:
         TRAIN: "training physics",
         "unseen": "unseen physics",
         COLLECTED: "training physics, while collecting",
+        HELD_OUT: "held-out recordings",
     }
     return names.get(group, f"unseen: {group.replace('_', ' ')}")
 

@@ -89,7 +89,7 @@ def findings(config: Config) -> Iterator[Finding]:
     with closing(environments):
         found = [_finding("action bounds", _bounds(environments))]
         if found[0].status == "ok":
-            found += _methods(environments.task)
+            found += method_findings(environments.task)
         yield from found
         if any(finding.status == "fault" for finding in found):
             yield Finding("transitions", "remark", "Not looked at before this is mended.")
@@ -123,7 +123,7 @@ def _bounds(environments: Environments) -> str:
     return f"{text} environment's bounds, {_short(theirs[0])} and {_short(theirs[1])}."
 
 
-def _methods(task: Task) -> Iterator[Finding]:
+def method_findings(task: Task) -> Iterator[Finding]:
     """Trace the methods of a Task for 6 transitions."""
     rng = np.random.default_rng(0)
     obs, next_obs = jnp.asarray(rng.normal(size=(2, 6, task.obs_size)), jnp.float32)

@@ -158,4 +158,7 @@ def _returns(metrics: Mapping[str, Any]) -> str:
         for name, found in returns.items()
         if found
     ]
+    errors = metrics.get("held_out_error") or []
+    for step in sorted({1, len(errors)} if errors else {}):
+        words.append(f"held-out error {errors[step - 1]:.3g} at imagined step {step}")
     return f"iteration {metrics['iteration'] + 1} done: {'; '.join(words)}"

@@ -363,7 +363,9 @@ class RunDir:
     def load_data(self, until: int | None = None) -> list[Trajectory]:
         """All trajectories that were collected up to an iteration, the newest by default."""
         finished = self.finished_iterations if until is None else until + 1
-        return [t for i in range(finished) for t in self.iteration_data(i)]
+        known = self._checksums(self.finished_iterations - 1)  # fits of recordings collect nothing
+        collected = [i for i in range(finished) if _name("data", i) in known]
+        return [t for i in collected for t in self.iteration_data(i)]
 
     def tests(self) -> dict[str, list[Trajectory]]:
         """The test episodes of the newest iteration by group; empty if there were none.
@@ -636,6 +638,12 @@ def trajectory_arrays(trajectories: Sequence[Trajectory]) -> tuple[Arrays, dict[
         {"sim_params": dict(t.sim_params), "terminated": bool(t.terminated)} for t in trajectories
     ]
     return arrays, {"episodes": episodes}
+
+
+def trajectories_digest(trajectories: Sequence[Trajectory]) -> str:
+    """SHA-256 of all their arrays."""
+    arrays, _ = trajectory_arrays(trajectories)
+    return hashlib.sha256(b"".join(array.tobytes() for array in arrays.values())).hexdigest()
 
 
 def trajectories_from(arrays: Arrays, facts: Mapping[str, Any]) -> list[Trajectory]:

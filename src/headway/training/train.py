@@ -1,10 +1,11 @@
 """The training loop: collect, fit, evaluate, save, and again (supplement A.2)."""
 
 import dataclasses
+import shutil
 import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing
+from contextlib import closing, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -15,7 +16,7 @@ from jaxtyping import PRNGKeyArray
 
 from headway.config import Config, override
 from headway.data import Trajectory
-from headway.errors import DivergenceError
+from headway.errors import DivergenceError, RunError
 from headway.models.fitting import EpochStats
 from headway.task import BUILT_IN
 from headway.training.check import compared, refuse_faults
@@ -28,9 +29,10 @@ from headway.training.collect import (
     random_policy,
 )
 from headway.training.evaluate import Tests, iteration_keys, run_tests
-from headway.training.files import tree_arrays, tree_from_arrays
+from headway.training.files import UNFINISHED, tree_arrays, tree_from_arrays, writing
 from headway.training.progress import Progress
-from headway.training.run import RunDir
+from headway.training.recordings import HELD_OUT, Log
+from headway.training.run import LOCK, RunDir
 from headway.training.stopping import StopRequest, stop_requests
 from headway.training.trainers import make_trainer
 
@@ -58,6 +60,7 @@ def train_run(
     on_iteration: OnIteration | None = None,
     *,
     resume_from_last_good: bool = False,
+    log: Log | None = None,
 ) -> RunDir:
     """Train until the last iteration, from wherever the run stands.
 
@@ -70,6 +73,8 @@ def train_run(
         progress: Shown while training; silent by default.
         on_iteration: Called after each iteration; what it raises ends the run.
         resume_from_last_good: Where a file is damaged, forget the iterations that stand on it.
+        log: Recordings to fit in every iteration, whose settings are `config`; no environment is
+            made, nothing is collected or tested.
 
     Raises:
         ConfigError: The settings do not fit the environment.
@@ -84,7 +89,8 @@ def train_run(
     _forget_programs()
     if config.collection.check and config.env not in BUILT_IN:
         run.refuse_changed()
-        refuse_faults(config)
+        if log is None:
+            refuse_faults(config)
     # A display begins once it is certain that the run does.
     with run.locked(), progress or Progress() as shown, stop_requests() as stop:
         if resume_from_last_good:
@@ -94,11 +100,43 @@ def train_run(
                 if good is None
                 else f"goes on after iteration {good}, which is intact"
             )
-        with closing(Environments.make(config)) as environments:
-            config = dataclasses.replace(config, spaces=environments.task.spaces)
+        made = nullcontext() if log else closing(Environments.make(config))
+        with made as environments:
+            if environments:
+                config = dataclasses.replace(config, spaces=environments.task.spaces)
             run.begin(config)
-            _Training(config, run, environments, shown, stop, on_iteration).train()
+            for remark in log.remarks if log else ():
+                shown.message(remark)
+            _Training(config, run, environments, shown, stop, on_iteration, log).train()
     return run
+
+
+def continued(run_dir: str | Path) -> Config:
+    """The settings of a finished run, for as many iterations again.
+
+    Raises:
+        RunError: There is no run, or it is not finished.
+    """
+    run = RunDir(run_dir)
+    config, finished = run.config(), run.finished_iterations
+    planned = config.collection.num_iterations
+    if finished < planned:
+        raise RunError(
+            f"{run.path} has {finished} of {planned} iterations, allowed: a finished run to go on"
+            " from; finish it first with the command that began it."
+        )
+    return override(config, {"collection.num_iterations": 2 * planned})
+
+
+def copy_run(run_dir: Path, to: Path) -> None:
+    """Copy a run, to go on with the copy; where there is something already, that is kept."""
+    if not to.exists():
+        unfinished = to.with_name(f".{to.name}{UNFINISHED}")
+        shutil.rmtree(unfinished, ignore_errors=True)
+        with writing(to):
+            left = shutil.ignore_patterns("partial", "figures", LOCK)
+            shutil.copytree(run_dir, unfinished, ignore=left)
+            unfinished.rename(to)
 
 
 @dataclasses.dataclass
@@ -108,10 +146,11 @@ class _Training:
     config: Config
     run: RunDir
     """The directory, which is locked."""
-    environments: Environments
+    environments: Environments | None
     progress: Progress
     stop: StopRequest
     on_iteration: OnIteration | None
+    log: Log | None = None
 
     def __post_init__(self):
         learns, begun = self.config.model.learns, self.run.finished_iterations > 0
@@ -128,13 +167,17 @@ class _Training:
             metrics: dict[str, Any] = {"iteration": iteration}
             collected: list[Trajectory] = []
             seconds = {}
-            if config.model.learns:
+            if self.log:
+                collected = [] if iteration else self.log.fitted
+                metrics |= {} if iteration else {"recordings": self.log.recordings}
+            elif config.model.learns:
                 rounds = self.collect(collect_key)
                 collected = [one for rollout in rounds for one in rollout.episodes.values()]
                 seconds["collect"] = sum(rollout.seconds for rollout in rounds)
-                self.data += collected
                 failures = {"planner_failures": sum(rollout.use.failures for rollout in rounds)}
                 metrics["collection"] = _summary(collected) | failures
+            self.data += collected
+            if config.model.learns:
                 metrics["fitting"], seconds["fit"] = self.fit(fit_key)
             tests = self.evaluate(test_key)
             seconds["evaluate"] = tests.seconds
@@ -145,10 +188,14 @@ class _Training:
                 "test_planner_failures": tests.use.failures,
                 "seconds": {name: round(value, 3) for name, value in seconds.items()},
             }
+            if self.log and self.log.held_out:
+                tested = {HELD_OUT: self.log.held_out}
             errors = {
                 group: trainer.prediction_error(self.state, found, error_key)
                 for group, found in tested.items()
             }
+            if self.log:
+                metrics["held_out_error"] = [float(e) for e in errors.get(HELD_OUT, ())]
             shares = trainer.head_shares(self.state, self.data)
             tables = {
                 "evaluation.csv": [row.to_csv() for row in tests.rows(config, iteration)],
@@ -171,6 +218,8 @@ class _Training:
         """The groups that are tested after this iteration; often none."""
         evaluation, number = self.config.evaluation, self.iteration + 1
         last = number == self.config.collection.num_iterations
+        if self.environments is None:
+            return []
         if not last and number % evaluation.every:
             return []
         train, *unseen = self.environments.sim_params.group_names
@@ -193,6 +242,7 @@ class _Training:
         Physics come from the training set; those of an environment of your own are dealt evenly.
         """
         environments, collection = self.environments, self.config.collection
+        assert environments is not None
         own, sets = self.config.env not in BUILT_IN, environments.sim_params
         count, agent = collection.num_episodes, None
         batches, rounds, steps = self.batches("collection"), [], 0
@@ -224,6 +274,7 @@ class _Training:
 
     def batches(self, phase: Literal["collection", "evaluation"]) -> Batches:
         """Run the episodes of a phase."""
+        assert self.environments is not None
         say = self.progress.message
         return Batches(self.environments, self.config, phase, self.on_step, say, self.partial)
 
