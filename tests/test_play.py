@@ -222,6 +222,8 @@ def served(tmp_path, monkeypatch, request):
         ).path
     player = Player(run)
     shown = Page(player, "127.0.0.1", 8300)
+    # Reflections take half a minute where there is no GPU.
+    shown.server.scene.configure_environment_map(None)
     thread = threading.Thread(target=player.run, args=[shown.show])
     thread.start()
     yield SimpleNamespace(player=player, address=shown.address)

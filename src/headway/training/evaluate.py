@@ -244,7 +244,7 @@ def evaluate(
         sets, usual = sim_param_sets(config), env_spec(config.env).default_sim_params
         told = config.model.context == "sim-params"  # of them, no more and no less
         for name in sim_params:
-            if name not in (allowed := sets.names if told else usual):
+            if name not in (allowed := sets.names if told else {*sets.names, *usual}):
                 raise ConfigError(str(unknown_name("sim_param", name, allowed)))
         added = {name: [usual[name]] for name in sim_params if name not in sets.names}
         known = {**sets.train, **added}
