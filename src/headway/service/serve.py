@@ -26,6 +26,7 @@ from headway.training.methods import config_to_evaluate
 from headway.training.run import Iteration, RunDir
 from headway.training.trainers import load_agent
 
+Ready = Callable[[dict[str, Any]], Any]
 LONGEST = 2**16
 """Bytes of a message at most."""
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -47,7 +48,7 @@ def serve(  # noqa: PLR0913 (keywords, all with a default)
     silence_s: float = 60.0,
     iteration: Iteration = None,
     settings: Mapping[str, Any] | None = None,
-    ready: Callable[[dict[str, Any]], Any] = print,
+    ready: Ready = print,
     say: Callable[[str], Any] = print,
 ) -> None:
     """Serve the controller of a run until Ctrl-C or SIGTERM; blocks.
@@ -92,7 +93,7 @@ def serve(  # noqa: PLR0913 (keywords, all with a default)
     about = describe(run, config, agent) | limits
     with ThreadPoolExecutor(max_robots, thread_name_prefix="headway-robot") as threads:
         sessions = Sessions(controllers, about, threads, silence_s, say)
-        asyncio.run(_listen(sessions, host, port, token, ready))
+        asyncio.run(sessions.listen(host, port, token, ready))
 
 
 @dataclasses.dataclass
@@ -109,6 +110,48 @@ class Sessions:
     """Seconds without a message after which a session is closed."""
     say: Callable[[str], Any]
     """Called with a line when a robot comes or goes."""
+
+    async def listen(self, host: str, port: int, token: str | None, ready: Ready) -> None:
+        """Wait for robots until Ctrl-C or SIGTERM.
+
+        Raises:
+            RunError: The address cannot be listened on.
+        """
+        from websockets.asyncio.server import serve as listen
+
+        def refuse(robot: Any, request: Any) -> Any:
+            """Answer a handshake without the token; None lets it go on."""
+            given = " ".join(request.headers.get_all("Authorization")).encode()
+            if token and not hmac.compare_digest(given, f"Bearer {token}".encode()):
+                error = {"error": "token missing or wrong, allowed: Authorization: Bearer TOKEN"}
+                return robot.respond(HTTPStatus.UNAUTHORIZED, json.dumps(error) + "\n")
+            return None
+
+        quiet = logging.getLogger("headway.serve")  # strangers' handshakes are no news
+        quiet.setLevel(logging.CRITICAL)
+        stop, loop = asyncio.Event(), asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            with contextlib.suppress(RuntimeError, ValueError):  # not in every thread and system
+                loop.add_signal_handler(number, stop.set)
+        try:
+            server = await listen(
+                self.session,
+                host,
+                port,
+                process_request=refuse,
+                origins=[None],  # a page in somebody's browser is no robot
+                max_size=LONGEST,
+                compression=None,
+                close_timeout=1,
+                logger=quiet,
+            )
+        except OSError as error:
+            reason = one_line(error.strerror or error)
+            raise RunError(f"cannot listen on {host}:{port}: {reason}; choose another.") from None
+        async with server:
+            where, port = f"[{host}]" if ":" in host else host, server.sockets[0].getsockname()[1]
+            ready({"url": f"ws://{where}:{port}", "description": self.about})
+            await stop.wait()
 
     async def session(self, robot: Any) -> None:
         """One robot's, from its connection to its end."""
@@ -159,13 +202,9 @@ def answered(
             controller.reset(physics if isinstance(physics, dict) else None)
             return {"reset": True}
         action = controller.act(asked["obs"], applied_action=asked.get("applied_action"))
-    except HeadwayError as error:
-        return {"error": one_line(error), "type": type(error).__name__}
-    except (ValueError, RecursionError) as error:
-        return {
-            "error": f"the message cannot be read ({one_line(error, 80)})",
-            "type": "ConfigError",
-        }
+    except (HeadwayError, ValueError, RecursionError) as error:
+        what = "" if isinstance(error, HeadwayError) else "the message cannot be read: "
+        return {"error": what + one_line(error, 300), "type": type(error).__name__}
     status, heads = controller.status, controller.heads
     assert status is not None
     return {
@@ -173,47 +212,3 @@ def answered(
         **status._asdict(),
         "heads": None if heads is None else heads.tolist(),
     }
-
-
-async def _listen(
-    sessions: Sessions,
-    host: str,
-    port: int,
-    token: str | None,
-    ready: Callable[[dict[str, Any]], Any],
-) -> None:
-    from websockets.asyncio.server import serve as listen
-
-    def refuse(robot: Any, request: Any) -> Any:
-        """Answer a handshake without the token; None lets it go on."""
-        shown = " ".join(request.headers.get_all("Authorization")).encode()
-        if token and not hmac.compare_digest(shown, f"Bearer {token}".encode()):
-            error = {"error": "token missing or wrong, allowed: Authorization: Bearer TOKEN"}
-            return robot.respond(HTTPStatus.UNAUTHORIZED, json.dumps(error) + "\n")
-        return None
-
-    quiet = logging.getLogger("headway.serve")  # strangers' handshakes are no news
-    quiet.setLevel(logging.CRITICAL)
-    stop, loop = asyncio.Event(), asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        with contextlib.suppress(NotImplementedError, RuntimeError, ValueError):  # not main thread
-            loop.add_signal_handler(number, stop.set)
-    try:
-        server = await listen(
-            sessions.session,
-            host,
-            port,
-            process_request=refuse,
-            origins=[None],  # a page in somebody's browser is no robot
-            max_size=LONGEST,
-            compression=None,
-            close_timeout=1,
-            logger=quiet,
-        )
-    except OSError as error:
-        reason = one_line(error.strerror or error)
-        raise RunError(f"cannot listen on {host}:{port}: {reason}; choose another.") from None
-    async with server:
-        where, port = host if ":" not in host else f"[{host}]", server.sockets[0].getsockname()[1]
-        ready({"url": f"ws://{where}:{port}", "description": sessions.about})
-        await stop.wait()
