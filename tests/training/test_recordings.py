@@ -80,6 +80,7 @@ def tail_flag(row, steps=25):
         (changed(step=np.arange(26) % 13), [12, 12], 2),
         (changed(episode=["a"] * 6 + ["b"] * 20), [5, 19], 2),
         (changed(terminated=tail_flag(9)), [10, 15], 2),
+        (changed(terminated=True), [25], 1),
         (changed(obs=lambda obs: obs[:-1], dones=tail_flag(9)), [9, 14], 2),
         (changed(**{"sim_params.length": np.repeat([0.5, 1.0], 13)}), [12, 12], 2),
         (recording(70), [30, 30, 10], 1),
@@ -204,6 +205,25 @@ def test_a_task_is_enough_where_no_environment_can_be_made(monkeypatch):
     np.testing.assert_allclose(log.fitted[0].reward, -(np.arange(1, 9.0) ** 2))
 
 
+class Pole(headway.Task):
+    """Paid for every step."""
+
+    def reward(self, obs, action, next_obs):
+        return jnp.ones(obs.shape[:-1])
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_categories_are_numbers_in_a_recording(monkeypatch):
+    monkeypatch.setattr(task, "_registered", {})
+    sets = headway.SimParamSets({"mass": [1.0]})
+    headway.register(headway.EnvSpec("pole", "CartPole-v1", Pole, sets, 50, {"mass": 1.0}))
+    log = read([{"obs": np.zeros((4, 4)), "action": [0, 1, 1], "terminated": 1}], env="pole")
+    np.testing.assert_array_equal(log.fitted[0].action, [[1, -1], [-1, 1], [-1, 1]])
+    assert log.fitted[0].terminated
+    with pytest.raises(ConfigError, match=r"action\[0\] is 0\.5 in row 1, allowed: 0 to 1"):
+        read([{"obs": np.zeros((4, 4)), "action": [0, 0.5, 1]}], env="pole")
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A folder of recordings."""
@@ -220,7 +240,7 @@ def fitted(folder, tmp_path_factory):
     return headway.fit(folder, "pendulum", preset="smoke", run_dir=path, settings=SETTINGS)
 
 
-def test_a_fit_is_a_run(fitted, capsys):
+def test_a_fit_is_a_run(fitted, folder, capsys):
     assert not fitted.evaluation
     first, last = fitted.metrics
     assert [row["transitions"] for row in first["recordings"]] == [28] * 5
@@ -233,7 +253,7 @@ def test_a_fit_is_a_run(fitted, capsys):
     assert headway.diagnose(fitted.path).episodes.keys() == {"held-out"}
     assert len(headway.evaluate(fitted.path, num_episodes=1)) == 3
     assert "held-out" in headway.write_report([fitted.path], fitted.path / "r.html").read_text()
-    command = ["fit", str(fitted.config.log["data"]), "--task", "pendulum", "--preset", "smoke"]
+    command = ["fit", str(folder), "--task", "pendulum", "--preset", "smoke"]
     asked = [f"--{name}={value}" for name, value in SETTINGS.items() if "sizes" not in name]
     sizes = ["--model.hidden-sizes", "8", "8", "--model.context-hidden-sizes", "8"]
     assert main([*command, *asked, *sizes, "--run-dir", str(fitted.path), "--json"]) == 0

@@ -389,34 +389,30 @@ def fitted(run_dir: str | Path) -> tuple[dict[str, Any], Table, Table]:
         if step <= len(errors):
             accuracy.add_row(str(step), f"{errors[step - 1]:.3g}")
     accuracy.caption = "in standard deviations; 1 is no better than the mean"
-    shares = pd.DataFrame(run.assignments(), columns=["iteration", "member", "sim_params", "share"])
+    rows = [row for row in run.assignments() if row["iteration"] == metrics[-1]["iteration"]]
     found = []
-    for text, own in shares[shares.iteration == metrics[-1]["iteration"]].groupby("sim_params"):
-        physics = parse_sim_params(str(text))
+    for text in dict.fromkeys(row["sim_params"] for row in rows):
+        own = pd.DataFrame([row for row in rows if row["sim_params"] == text])
+        shares = own.pivot(index="member", columns="head", values="share")
+        physics = parse_sim_params(text)
         number = int(physics.pop(RECORDING))
-        by_head = [member.share.to_numpy() for _, member in own.groupby("member")]
-        best = [int(np.argmax(share)) for share in by_head]
-        share = float(np.mean([share.max() for share in by_head]))
         about = {"recording": number, "sim_params": physics, **recordings[number]}
-        found.append({**about, "heads": best, "share": share})
+        best = {"heads": shares.idxmax(axis=1).tolist(), "share": float(shares.max(axis=1).mean())}
+        found.append(about | best)
     found.sort(key=lambda row: (row["heads"], row["recording"]))
-    heads = new_table(
-        "Which head of each member explains a recording best",
-        *("heads", "physics", "file"),
-        numbers=("recording", "share", "transitions", "pieces"),
-    )
+    columns = ("recording", "share", "transitions", "pieces")
+    title = "Which head of each member explains a recording best"
+    heads = new_table(title, "heads", "physics", "file", numbers=columns)
     names = varying([row["sim_params"] for row in found])
     for row in found[:MOST_RECORDINGS]:
         cells = " ".join(map(str, row["heads"])), full_label(row["sim_params"], names) or "–"
-        numbers = row["recording"], f"{row['share']:.0%}", row["transitions"], row["pieces"]
-        heads.add_row(*cells, row["file"], *map(str, numbers))
+        numbers = [f"{row[n]:.0%}" if n == "share" else str(row[n]) for n in columns]
+        heads.add_row(*cells, row["file"], *numbers)
     heads.caption = (
-        "share of its segments, mean over members; head numbers of members are unrelated"
+        f"share: of its segments, mean over members, whose head numbers are unrelated;"
+        f" {max(len(found) - MOST_RECORDINGS, 0)} more in assignments.csv,"
+        f" {sum(row['held_out'] for row in recordings)} held out"
     )
-    if found[MOST_RECORDINGS:]:
-        heads.caption += f"; {len(found) - MOST_RECORDINGS} more in assignments.csv"
-    out = sum(row["held_out"] for row in recordings)
-    heads.caption += f"; {out} recordings were held out"
     return {"held_out_error": errors, "recordings": found}, accuracy, heads
 
 

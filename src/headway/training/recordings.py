@@ -101,7 +101,7 @@ def read_log(data: Data, config: Config, held_out: float, names: Mapping[str, st
         recordings[number]["pieces"] += 1
         recordings[number]["transitions"] += len(piece)
     log = {
-        "data": str(data) if isinstance(data, str | Path) else "arrays",
+        "data": Path(data).name if isinstance(data, str | Path) else "arrays",
         "rounds": config.collection.num_iterations,
         "sha256": trajectories_digest(parts[0] + parts[1]),
     }
@@ -243,11 +243,15 @@ class _Recording:
         return values.astype(np.float64)
 
     def column(self, name: str, rows: int, default: float = 0.0) -> np.ndarray:
-        """A number for each row, or one for all; of the last row nothing need be said."""
+        """A number for each row, or one for all; of the last row nothing need be said.
+
+        One that says how an episode ended is of the last action.
+        """
         values = self.numbers(name)
         values = np.array([default]) if values is None else values[:, 0]
         if len(values) == 1:
-            return np.repeat(values, rows)
+            last = name in ("terminated", "truncated")
+            return np.where(np.arange(rows) >= last * (rows - 2), values, 0.0)
         if len(values) == rows - 1:
             more = values[-1:] - values[-2:-1] if name == "time" else 0.0
             values = np.append(values, values[-1:] + more)
