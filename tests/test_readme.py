@@ -7,8 +7,10 @@ import types
 from pathlib import Path
 
 import jax.numpy as jnp
+import nbformat
 import numpy as np
 import pytest
+from nbclient import NotebookClient
 
 import headway
 from headway import task
@@ -64,6 +66,19 @@ def test_logged_data_guide(tmp_path, monkeypatch, capsys):
     (code,) = python_blocks("docs/logged-data.md")
     exec(compile(code, "logged-data.md", "exec"), {})
     assert capsys.readouterr().out.count(",") == 3  # an error for each step of the horizon
+
+
+def test_tutorial_notebook(tmp_path):
+    notebook = nbformat.read(ROOT / "docs/tutorial.ipynb", 4)
+    for cell in notebook.cells:  # the preset smoke has 20 steps
+        cell.source = cell.source.replace('"quick"', '"smoke"').replace("{60:", "{10:")
+    resources = {"metadata": {"path": str(tmp_path)}}
+    NotebookClient(notebook, timeout=300, kernel_name="python3", resources=resources).execute()
+    shown = [
+        out.data for cell in notebook.cells for out in cell.get("outputs", []) if "data" in out
+    ]
+    assert "Head selection" in shown[1]["text/html"]
+    assert "image/gif" in shown[-1]
 
 
 class Machine:
