@@ -109,10 +109,11 @@ def test_predictions_meet_what_happens_until_it_is_pushed(pendulum):
     pendulum.reset(0)
     for _ in range(100):
         pendulum.step()
-    errors = [abs(m.expected - m.obs).max() for m in list(pendulum.moments)[20:]]
+    errors = [abs(m.imagined[0] - m.obs).max() for m in list(pendulum.moments)[20:]]
     assert np.median(errors) < 0.05
-    assert pendulum.plan.shape == (pendulum.config.planner.horizon - 1, 3)
-    spin, expected = pendulum.obs[2], pendulum.plan[0, 2]
+    plan = pendulum.moments[-1].imagined
+    assert plan.shape == (pendulum.config.planner.horizon, 3)
+    spin, expected = pendulum.obs[2], plan[1, 2]
     pendulum.push(3.0)
     assert pendulum.obs[2] == pytest.approx(spin + 3.0, abs=1e-5)
     pendulum.step()

@@ -189,11 +189,12 @@ class Page:
         entry, step = self._entry.options.index(self._entry.value), 1 / player.rate
         past = step * np.arange(1 - len(moments), 1)
         real = np.array([moment.obs[entry] for moment in moments])
-        seen = [m.obs[entry] if m.expected is None else m.expected[entry] for m in moments]
-        plan = np.zeros(0) if player.plan is None else player.plan[:, entry]
-        ahead = step * np.arange(1, len(plan) + 1)
-        times, unknown = np.concatenate([past, ahead]), np.full(len(plan), np.nan)
-        self._motion.data = times, np.concatenate([real, unknown]), np.concatenate([seen, plan])
+        seen = [m.obs[entry] if m.imagined is None else m.imagined[0, entry] for m in moments]
+        newest = moments[-1].imagined
+        plan = np.zeros(0) if newest is None else newest[1:, entry]
+        times = step * np.arange(1 - len(moments), len(plan) + 1)
+        real = np.concatenate([real, np.full(len(plan), np.nan)])  # uPlot wants no NaN first
+        self._motion.data = times, real, np.concatenate([seen, plan])
         self._paid.data = past, np.array([moment.reward for moment in moments])
         self._taken.data = past, np.array([1e3 * moment.seconds for moment in moments])
 

@@ -31,8 +31,9 @@ class Moment(NamedTuple):
 
     obs: Float[np.ndarray, " obs"]
     """What was observed after the step."""
-    expected: Float[np.ndarray, " obs"] | None
-    """The mean of what the members predicted; None where there was no new plan."""
+    imagined: Float[np.ndarray, "horizon obs"] | None
+    """What the plan of that step led to in the mean of the members, from this step on; None where
+    there was no new plan."""
     reward: float
     heads: Int[np.ndarray, " member"] | None
     """The head that each member planned with; None where the model has none."""
@@ -50,18 +51,17 @@ class Player:
 
     Args:
         run_dir: The run directory.
-        seed: Seeds the environment and the planner's draws.
 
     Raises:
         RunError: There is no trained run, or it is damaged.
         BadEnvironmentError: The environment cannot be made.
     """
 
-    def __init__(self, run_dir: str | Path, *, seed: int = 0):
-        self._run_dir, self._seed = run_dir, seed
+    def __init__(self, run_dir: str | Path):
+        self._run_dir = run_dir
         self.config = RunDir(run_dir).config()
         self.spec = env_spec(self.config.env)
-        self.controller = load(run_dir, seed=seed)
+        self.controller = load(run_dir)
         endless = {"episode_length": LARGEST, "num_episodes": 1, "env_processes": False}
         config = override(self.config, {f"collection.{n}": v for n, v in endless.items()})
         try:
@@ -78,14 +78,12 @@ class Player:
         self.moments: deque[Moment] = deque(maxlen=REMEMBERED)
         self.obs: Float[np.ndarray, " obs"]
         """The newest observation."""
-        self.plan: Float[np.ndarray, "horizon obs"] | None = None
-        """The mean of what the members expect along the last plan, after its first step."""
         self.asked: queue.Queue[Callable[[], Any]] = queue.Queue()
         """Changes that wait."""
         self._ends: deque[float] = deque(maxlen=21)  # times at which the last steps ended
         self.sim_params = dict(self.spec.default_sim_params)
         """The physics now in force, or at the next reset."""
-        self.reset(seed)
+        self.reset(0)
 
     @property
     def ranges(self) -> dict[str, tuple[float, ...] | Uniform]:
@@ -103,8 +101,8 @@ class Player:
                 values |= {given.low, given.high} if isinstance(given, Uniform) else {*given}
             kinds = min(values) <= 0 and all(value.is_integer() for value in values)
             if len(values) > 1:
-                low_high = min(values), max(values)
-                found[name] = tuple(sorted(values)) if kinds else Uniform(*low_high)
+                ends = Uniform(min(values), max(values))
+                found[name] = tuple(sorted(values)) if kinds else ends
         return found
 
     @property
@@ -118,7 +116,7 @@ class Player:
         with raising(self.spec.name, "reset"):
             obs, _ = self.env.reset(seed=seed, options={"sim_params": self._varied()})
         self.controller.reset(self.sim_params)
-        self.obs, self.plan, self._changed = obs[0], None, False
+        self.obs, self._changed = obs[0], False
         self.moments.clear()
 
     def set_sim_params(self, values: Mapping[str, float]) -> None:
@@ -152,7 +150,7 @@ class Player:
         Raises:
             ConfigError: A setting is unknown, of the wrong type or out of range.
         """
-        self.controller = load(self._run_dir, seed=self._seed, settings=settings)
+        self.controller = load(self._run_dir, settings=settings)
         self.controller.reset(self.sim_params)
 
     def step(self) -> None:
@@ -168,18 +166,16 @@ class Player:
             self.reset()
             return
         status, imagined = self.controller.status, self.controller.imagine()
-        expected = None if imagined is None else imagined.mean(0)
         with raising(self.spec.name, "a step"):
             obs, reward, ends, cut, info = self.env.step(np.asarray(action)[None])
         if "broken" in info:
             self.message = f"{self.spec.name} broke: {info['broken'][0]}"
             self.reset()
             return
-        self.obs, self.plan = obs[0], None if expected is None else expected[1:]
-        first = None if expected is None else expected[0]
+        self.obs, mean = obs[0], None if imagined is None else imagined.mean(0)
         seconds = status.seconds if status else 0.0
         about = float(reward[0]), self.controller.heads, seconds, self._changed
-        self.moments.append(Moment(obs[0].copy(), first, *about))
+        self.moments.append(Moment(self.obs, mean, *about))
         self._changed = False
         if ends[0] or cut[0]:
             self.message = "The episode ended; another one begins."
@@ -225,9 +221,5 @@ class Player:
 
     def _varied(self) -> dict[str, float]:
         """What `reset` may be told: of an environment of one's own the parameters of its sets."""
-        built_in = hasattr(self.env, "world")
-        return {
-            name: value
-            for name, value in self.sim_params.items()
-            if built_in or name in self._sets.names
-        }
+        known = self.sim_params if hasattr(self.env, "world") else self._sets.names
+        return {name: self.sim_params[name] for name in known}
