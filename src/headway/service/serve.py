@@ -11,6 +11,7 @@ import hmac
 import json
 import logging
 import signal
+import warnings
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from http import HTTPStatus
@@ -86,9 +87,11 @@ def serve(  # noqa: PLR0913 (keywords, all with a default)
     run = RunDir(run_dir)
     config = config_to_evaluate(run.config(), settings or {}, ("planner",))
     agent = load_agent(run, config, iteration=iteration)
-    controllers = [
-        Controller(agent, seed=seed, deadline_ms=deadline_ms) for seed in range(max_robots)
-    ]
+    controllers = [Controller(agent, deadline_ms=deadline_ms)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # all would say the same
+        for seed in range(1, max_robots):
+            controllers.append(Controller(agent, seed=seed, deadline_ms=deadline_ms))
     limits = {"deadline_ms": deadline_ms, "max_robots": max_robots}
     about = describe(run, config, agent) | limits
     with ThreadPoolExecutor(max_robots, thread_name_prefix="headway-robot") as threads:
