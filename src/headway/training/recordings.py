@@ -156,7 +156,7 @@ def _tables(data: Data) -> Iterator[tuple[str, Mapping[str, Any]]]:
 
 
 def _npz(file: Path) -> Mapping[str, Any]:
-    with np.load(file, allow_pickle=False) as arrays:
+    with np.load(file) as arrays:  # never unpickles
         return dict(arrays)
 
 
