@@ -156,7 +156,7 @@ def _tables(data: Data) -> Iterator[tuple[str, Mapping[str, Any]]]:
 
 
 def _npz(file: Path) -> Mapping[str, Any]:
-    with np.load(file, allow_pickle=False) as arrays:
+    with np.load(file) as arrays:  # never unpickles
         return dict(arrays)
 
 
@@ -311,7 +311,7 @@ class _Cutter:
             for name in ("terminated", "truncated")
         )
         ends = terminated | truncated
-        known, taken = np.isfinite(obs).all(1), np.isfinite(action).all(1)
+        known, taken = (np.all(np.isfinite(values), axis=1) for values in (obs, action))
         self.gaps += int(gap.sum())
         self.missing += int((~known).sum() + (~taken).sum())
         valid = known[:-1] & known[1:] & taken & ~other & ~gap & (last_known | ~ends)
