@@ -346,12 +346,13 @@ class _Training:
             "rollbacks": rollbacks,
             "transitions": sum(map(len, self.data)),
         }
-        batches, size = int(history[-1].updates), self.config.fitting.batch_size
-        if batches < FEW_BATCHES:
+        batches, steps = self.trainer.num_batches(self.data), measured["transitions"]
+        if batches < FEW_BATCHES and 2 * steps < len(self.data) * self.environments.episode_length:
             warnings.warn(
-                f"{self.config.env}, iteration {iteration}: {measured['transitions']} transitions"
-                f" make {batches} batches (fitting.batch_size {size}), too few to learn from; where"
-                " episodes end early, raise collection.min_steps, the steps per iteration.",
+                f"{self.config.env}, iteration {iteration}: {steps} transitions make {batches}"
+                f" batches (fitting.batch_size {self.config.fitting.batch_size}), too few to learn"
+                " from, because episodes end early; raise collection.min_steps, the steps per"
+                " iteration.",
                 stacklevel=1,
             )
         return measured, seconds + time.perf_counter() - started

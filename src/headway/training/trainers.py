@@ -76,10 +76,14 @@ class Trainer:
             trajectories: All data so far.
         """
         fitting = self.config.fitting
+        return max(fitting.epochs, -(-fitting.min_updates // self.num_batches(trajectories)))
+
+    def num_batches(self, trajectories: Sequence[Trajectory]) -> int:
+        """Batches in one pass over the data."""
+        fitting = self.config.fitting
         offsets = range(fitting.future_length)
         samples = sum(max(0, len(one) - offset) for one in trajectories for offset in offsets)
-        updates = -(-samples // fitting.batch_size)
-        return max(fitting.epochs, -(-fitting.min_updates // updates))
+        return -(-samples // fitting.batch_size)
 
     def fit(
         self,
