@@ -141,6 +141,7 @@ def fit(  # noqa: PLR0913 (keywords, all with a default)
     held_out: float = 0.2,
     names: Mapping[str, str] | None = None,
     progress: Progress | None = None,
+    resume_from_last_good: bool = False,
 ) -> Run:
     """Fit a model to recordings alone; no environment is stepped (docs/logged-data.md).
 
@@ -161,6 +162,7 @@ def fit(  # noqa: PLR0913 (keywords, all with a default)
         names: What arrays are called where that is not guessed, several of them with commas:
             `{"obs": "angle,speed", "action": "torque"}`.
         progress: As in `train`.
+        resume_from_last_good: As in `train`.
 
     Raises:
         ConfigError: A recording cannot be read, or does not fit the environment.
@@ -169,7 +171,13 @@ def fit(  # noqa: PLR0913 (keywords, all with a default)
     prepare_jax()
     config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
     log = read_log(data, config, held_out, names or {})
-    run = train_run(log.config, run_dir or f"{_usual_dir(config)}-fit", _watched(progress), log=log)
+    run = train_run(
+        log.config,
+        run_dir or f"{_usual_dir(config)}-fit",
+        _watched(progress),
+        resume_from_last_good=resume_from_last_good,
+        log=log,
+    )
     return Run(run.path, run.config(), run.metrics(), run.evaluation())
 
 

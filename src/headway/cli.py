@@ -290,6 +290,7 @@ class Fit(Train):
             held_out=self.held_out,
             names={name: text for name, _, text in (w.partition("=") for w in self.names)},
             progress=self.progress(),
+            resume_from_last_good=self.resume_from_last_good,
         )
         drawn = [str(path) for path in figures.save_run_figures(run.path)]
         facts, *shown = tables.fitted(run.path)
