@@ -194,7 +194,7 @@ PAGES = [
 @pytest.mark.parametrize("command", COMMANDS)
 def test_options_that_the_pages_show_exist(command, capsys):
     with pytest.raises(SystemExit):
-        main([command, "--help"])
+        main([command, "--help-all"])
     offered = set(re.findall(r"--[a-z][\w.-]*\w", capsys.readouterr().out))
     for page in PAGES:
         text = re.sub(r"\\\n\s*", " ", page.read_text())

@@ -52,7 +52,7 @@ def num_shards(num_steps: int) -> int:
 
 def in_shards(
     returns_of: Callable[[Shard | None], Float[Array, "shard_env shard_candidate"]],
-    shape: tuple[int, int],
+    shape: tuple[int, ...],
     shards: int,
 ) -> list[Float[Array, "shard_env shard_candidate"]]:
     """Compute returns in shards of one size, side by side; `joined` puts them together.
@@ -87,7 +87,7 @@ def in_shards(
 
 
 def joined(
-    shards: list[Float[Array, "shard_env shard_candidate"]], shape: tuple[int, int]
+    shards: list[Float[Array, "shard_env shard_candidate"]], shape: tuple[int, ...]
 ) -> Float[Array, "env candidate"]:
     """The returns of all; the last shard may overlap with the one before."""
     *before, last = shards
