@@ -67,7 +67,8 @@ def lamp(tmp_path, monkeypatch, cls=Lamp):
     """A run with a lamp that acts at random."""
     monkeypatch.setattr(task, "_registered", dict(task._registered))
     power = SimParamSets({"power": Uniform(1, 2)}, {"weak": {"power": [0.5]}})
-    headway.register(EnvSpec("lamp", cls, PointTask, power, 6, {"power": 1.0}))
+    own = {"name": "lamp", "env_id": cls, "make_task": PointTask, "episode_length": 6}
+    headway.register(EnvSpec(**own, sim_params=power, default_sim_params={"power": 1.0}))
     settings = {"collection.check": False, "collection.num_iterations": 1}
     run = headway.train(
         "lamp", method="random", preset="smoke", run_dir=tmp_path / "run", settings=settings
