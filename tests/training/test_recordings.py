@@ -120,7 +120,8 @@ def test_cuts_are_said_and_rewards_that_are_missing_are_the_tasks():
         (changed(obs=np.zeros((26, 2))), {}, "a row of obs has 2 numbers, allowed: 3"),
         (changed(action=np.zeros((9, 1))), {}, "has 26 obs and 9 actions, allowed"),
         (changed(action=np.full((25, 1), 2.5)), {}, "action[0] is 2.5 in row 0, allowed: -2 to 2"),
-        (changed(obs=np.full((26, 3), "a")), {}, "obs is of type <U1, allowed: numbers"),
+        (changed(obs=np.full((26, 3), "a")), {}, "obs cannot be read: could not convert string"),
+        ({"x": [1, 2], "y": [1], "action": [0]}, {"obs": "x,y"}, "data[0]: obs cannot be read: "),
         (changed(time=np.arange(7)), {}, "time has 7 rows, allowed: 1, 25 or 26"),
         (changed(obs=with_nan(slice(None, None, 2))), {}, "have no transition"),
         (changed(**{"sim_params.lenght": 1}), {}, "Did you mean 'sim_params.length'?"),
@@ -196,7 +197,11 @@ def no_environment(**options):
 def test_a_task_is_enough_where_no_environment_can_be_made(monkeypatch):
     monkeypatch.setattr(task, "_registered", {})
     sets = headway.SimParamSets({"mass": [1.0]})
-    headway.register(headway.EnvSpec("push", no_environment, Push, sets, 50, {"mass": 1.0}))
+    headway.register(
+        headway.EnvSpec(
+            name="push", env_id=no_environment, make_task=Push, sim_params=sets, episode_length=50
+        )
+    )
     log = read(
         [{"x": np.arange(9.0), "u": np.zeros(9)}], names={"obs": "x", "action": "u"}, env="push"
     )
@@ -216,7 +221,11 @@ class Pole(headway.Task):
 def test_categories_are_numbers_in_a_recording(monkeypatch):
     monkeypatch.setattr(task, "_registered", {})
     sets = headway.SimParamSets({"mass": [1.0]})
-    headway.register(headway.EnvSpec("pole", "CartPole-v1", Pole, sets, 50, {"mass": 1.0}))
+    headway.register(
+        headway.EnvSpec(
+            name="pole", env_id="CartPole-v1", make_task=Pole, sim_params=sets, episode_length=50
+        )
+    )
     log = read([{"obs": np.zeros((4, 4)), "action": [0, 1, 1], "terminated": 1}], env="pole")
     np.testing.assert_array_equal(log.fitted[0].action, [[1, -1], [-1, 1], [-1, 1]])
     assert log.fitted[0].terminated
