@@ -123,10 +123,8 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
         if env_spec(env).name != config.env:
             raise ConfigError(f"env is {env!r}, allowed: {config.env!r}, that of {from_run}.")
         copy_run(Path(from_run), path)
-    run = train_run(
-        config, path, _watched(progress), on_iteration, resume_from_last_good=resume_from_last_good
-    )
-    return Run(run.path, run.config(), run.metrics(), run.evaluation())
+    options = {"on_iteration": on_iteration, "resume_from_last_good": resume_from_last_good}
+    return _run(config, path, progress, **options)
 
 
 def fit(  # noqa: PLR0913 (keywords, all with a default)
@@ -171,19 +169,14 @@ def fit(  # noqa: PLR0913 (keywords, all with a default)
     prepare_jax()
     config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
     log = read_log(data, config, held_out, names or {})
-    run = train_run(
-        log.config,
-        run_dir or f"{_usual_dir(config)}-fit",
-        _watched(progress),
-        resume_from_last_good=resume_from_last_good,
-        log=log,
-    )
-    return Run(run.path, run.config(), run.metrics(), run.evaluation())
+    path = Path(run_dir or f"{_usual_dir(config)}-fit")
+    return _run(log.config, path, progress, log=log, resume_from_last_good=resume_from_last_good)
 
 
-def _watched(progress: Progress | None) -> Progress:
+def _run(config: Config, path: Path, progress: Progress | None, **options: Any) -> Run:
     watched = sys.stderr.isatty() or "ipykernel" in sys.modules
-    return progress or make_progress(quiet=not watched)
+    run = train_run(config, path, progress or make_progress(quiet=not watched), **options)
+    return Run(run.path, run.config(), run.metrics(), run.evaluation())
 
 
 def _usual_dir(config: Config) -> Path:

@@ -15,7 +15,7 @@ import shlex
 import sys
 import typing
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -41,6 +41,7 @@ PIPE_WIDTH = 130
 RESUMABLE = ("train", "fit", "reproduce", "sweep")
 TERMINATED = 143  # as a shell reports SIGTERM
 
+RUN_NAMES = ("env", "method", "preset", "seed")
 SECTIONS = ("model", "fitting", "planner", "collection", "evaluation")
 USUAL = {  # settings that --help shows; --help-all shows all of them
     "fitting": ("epochs", "precision"),
@@ -164,32 +165,32 @@ class Train(Command):
 
     def with_defaults(self, names):
         """Take the settings of environment, method and preset."""
-        config = self.base(
-            names.words[0] if names.words else "", names.method, names.preset, names.from_run
-        )
-        config = override(config, names.settings())
-        taken = ("method", "preset", *SECTIONS, *["env", "seed"] * bool(names.from_run))
+        named = {"env": names.task or names.words[0]} if names.task or names.words else {}
+        named |= {name: getattr(names, name) for name in ("method", "preset", "from_run")}
+        config = override(dataclasses.replace(self, **named).base(), names.settings())
+        taken = (*RUN_NAMES, *SECTIONS)
         return dataclasses.replace(self, **{name: getattr(config, name) for name in taken})
 
-    @staticmethod
-    def base(env: str, method: str, preset: str, from_run: Path | None = None) -> Config:
+    def base(self) -> Config:
         """The settings that all changes are made to."""
         from headway.training.methods import make_config
         from headway.training.train import continued
 
-        return continued(from_run) if from_run else make_config(env, method=method, preset=preset)
+        if self.from_run:
+            return continued(self.from_run)
+        return make_config(self.env, method=self.method, preset=self.preset)
 
     def settings(self) -> dict[str, Any]:
         """Settings by dotted name that differ from those of method and preset."""
-        config = self.base(self.env, self.method, self.preset, self.from_run)
+        config = self.base()
         settings = self.changed(config)
-        if self.from_run:
-            for name in ("env", "method", "preset", "seed"):
-                if getattr(self, name) != getattr(config, name):
-                    raise ConfigError(
-                        f"{name} is {getattr(self, name)!r}, allowed with --from:"
-                        f" {getattr(config, name)!r}, that of {self.from_run}; leave it out."
-                    )
+        for name in RUN_NAMES if self.from_run else ():
+            asked, own = getattr(self, name), getattr(config, name)
+            if asked != own:
+                raise ConfigError(
+                    f"{name} is {asked!r}, allowed with --from: {own!r}, that of {self.from_run};"
+                    " leave it out."
+                )
         if self.env_options:
             options = dict(config.env_options)
             for word in self.env_options:
@@ -208,30 +209,26 @@ class Train(Command):
                 ) from None
         return settings
 
+    def options(self) -> dict[str, Any]:
+        """Keywords that training and fitting share."""
+        names = ("method", "preset", "seed", "run_dir", "resume_from_last_good")
+        options = {name: getattr(self, name) for name in names}
+        return options | {"settings": self.settings(), "progress": self.progress()}
+
     def run(self, words):
         """Train, print the last tests, and what to do next."""
-        settings = self.settings()
+        options = self.options()
         from headway import api
         from headway.lab import figures, tables
 
-        run = api.train(
-            self.env,
-            method=self.method,
-            preset=self.preset,
-            seed=self.seed,
-            run_dir=self.run_dir,
-            from_run=self.from_run,
-            settings=settings,
-            progress=self.progress(),
-            resume_from_last_good=self.resume_from_last_good,
-        )
+        run = api.train(self.env, from_run=self.from_run, **options)
         rows = run.last_tests
         drawn = [str(path) for path in figures.save_run_figures(run.path)]
         title = f"{run.config.env}, {run.config.method} after {len(run.metrics)} iterations"
         tested, table = tables.evaluation(rows, run.config, title)
         facts = {
             "run_dir": str(run.path),
-            **{name: getattr(run.config, name) for name in ("env", "method", "preset", "seed")},
+            **{name: getattr(run.config, name) for name in RUN_NAMES},
             "iterations": len(run.metrics),
             "timesteps": run.metrics[-1]["timesteps"],
             **tested,
@@ -267,31 +264,14 @@ class Fit(Train):
     """What arrays are called, for example obs=angle,speed action=torque."""
     from_run: tyro.conf.Suppress[None] = None
 
-    def with_defaults(self, names):
-        """Take the settings of task, method and preset."""
-        if names.task is None:
-            return self
-        return super().with_defaults(dataclasses.replace(names, words=(names.task,)))
-
     def run(self, words):
         """Fit, print errors by imagined step and the heads of each recording."""
-        settings = self.settings()
+        options = self.options()
         from headway import api
         from headway.lab import figures, tables
 
-        run = api.fit(
-            self.data,
-            self.env,
-            method=self.method,
-            preset=self.preset,
-            seed=self.seed,
-            run_dir=self.run_dir,
-            settings=settings,
-            held_out=self.held_out,
-            names={name: text for name, _, text in (w.partition("=") for w in self.names)},
-            progress=self.progress(),
-            resume_from_last_good=self.resume_from_last_good,
-        )
+        names = {name: text for name, _, text in (word.partition("=") for word in self.names)}
+        run = api.fit(self.data, self.env, held_out=self.held_out, names=names, **options)
         drawn = [str(path) for path in figures.save_run_figures(run.path)]
         facts, *shown = tables.fitted(run.path)
         facts = {"run_dir": str(run.path), **facts, "figures": drawn}
@@ -892,33 +872,30 @@ def parse(words: Sequence[str]) -> Command:
         return tyro.cli(commands, args=words, prog="headway", description=told, config=config)
     command, rest = COMMANDS[words[0]], words[1:]
     names, _ = tyro.cli(Names, args=rest, add_help=False, return_unknown_args=True)
-    named = names.words or names.from_run
+    named = names.task if command is Fit else names.words or names.from_run
     default = command().with_defaults(names) if named else command()
     asked = functools.partial(tyro.cli, prog=f"headway {words[0]}", config=config)
     if {"-h", "--help"} & set(rest) and any(hasattr(default, name) for name in SECTIONS):
-        brief = {
-            name: _with_fields(value, hidden=set(vars(value)) - set(USUAL.get(name, ())))
-            for name, value in vars(default).items()
-            if name in SECTIONS
-        }
-        default = _with_fields(default, replaced=brief)
+        sections = {name: value for name, value in vars(default).items() if name in SECTIONS}
+        brief = {name: _brief(value, USUAL.get(name, ())) for name, value in sections.items()}
+        default = dataclasses.replace(default, **brief)
         told = f"{inspect.cleandoc(command.__doc__ or '')}\n--help-all shows all settings."
-        return asked(type(default), default=default, args=["--help"], description=told)
+        return asked(command, default=default, args=["--help"], description=told)
     rest = ["--help" if word == "--help-all" else word for word in rest]
     return asked(command, default=default, args=rest)
 
 
-def _with_fields(
-    value: Any, hidden: Collection[str] = (), replaced: Mapping[str, Any] | None = None
-) -> Any:
-    """A dataclass instance as tyro shows it, some of its fields hidden and others replaced."""
-    hints = typing.get_type_hints(type(value), include_extras=True)
-    kinds = {name: tyro.conf.Suppress[hints[name]] for name in hidden}
-    kinds |= {name: type(other) for name, other in (replaced or {}).items()}
-    values = vars(value) | dict(replaced or {})
-    fields = [(name, kind, dataclasses.field(default=values[name])) for name, kind in kinds.items()]
-    name, bases = type(value).__name__, (type(value),)
-    return dataclasses.make_dataclass(name, fields, bases=bases, frozen=True)(**values)
+def _brief(section: Any, shown: Sequence[str]) -> Any:
+    """The settings of a section as tyro shows them, most of them hidden."""
+    cls = type(section)
+    hints = typing.get_type_hints(cls, include_extras=True)
+    hidden = [
+        (name, tyro.conf.Suppress[hints[name]], dataclasses.field(default=value))
+        for name, value in vars(section).items()
+        if name not in shown
+    ]
+    made = dataclasses.make_dataclass(cls.__name__, hidden, bases=(cls,), frozen=True)
+    return made(**vars(section))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -384,17 +384,17 @@ def fitted(run_dir: str | Path) -> tuple[dict[str, Any], Table, Table]:
     run = RunDir(run_dir)
     metrics = run.metrics()
     errors, recordings = metrics[-1]["held_out_error"], metrics[0]["recordings"]
-    accuracy = new_table("Error of held-out recordings", numbers=["imagined step", "error"])
-    for step in (1, 2, 5, 10, 15, 20, 25, 30):
-        if step <= len(errors):
-            accuracy.add_row(str(step), f"{errors[step - 1]:.3g}")
+    steps = [step for step in (1, 2, 5, 10, 15, 20, 25, 30) if step <= len(errors)]
+    title = "Error of held-out recordings by imagined step"
+    accuracy = new_table(title, numbers=[str(step) for step in steps])
+    accuracy.add_row(*(f"{errors[step - 1]:.3g}" for step in steps))
     accuracy.caption = "in standard deviations; 1 is no better than the mean"
-    rows = [row for row in run.assignments() if row["iteration"] == metrics[-1]["iteration"]]
+    rows = pd.DataFrame(run.assignments(), columns=list(_FILES["assignments"][2]))
+    rows = rows[rows.iteration == metrics[-1]["iteration"]]
     found = []
-    for text in dict.fromkeys(row["sim_params"] for row in rows):
-        own = pd.DataFrame([row for row in rows if row["sim_params"] == text])
+    for text, own in rows.groupby("sim_params"):
         shares = own.pivot(index="member", columns="head", values="share")
-        physics = parse_sim_params(text)
+        physics = parse_sim_params(str(text))
         number = int(physics.pop(RECORDING))
         about = {"recording": number, "sim_params": physics, **recordings[number]}
         best = {"heads": shares.idxmax(axis=1).tolist(), "share": float(shares.max(axis=1).mean())}

@@ -4,6 +4,7 @@ import contextlib
 import errno
 import json
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -157,6 +158,16 @@ def writing(path: Path) -> Iterator[None]:
                 " goes on."
             ) from None
         raise RunError(f"{path} cannot be written: {error.strerror}; check the path.") from None
+
+
+@contextlib.contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """A folder to make and fill, which is renamed to `path` once it is whole."""
+    unfinished = path.with_name(f".{path.name}{UNFINISHED}")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    with writing(path):
+        yield unfinished
+        unfinished.rename(path)
 
 
 @contextlib.contextmanager

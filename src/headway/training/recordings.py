@@ -6,11 +6,11 @@ with a missing number, and gaps in time, cut it; what nothing can be made of is 
 
 import dataclasses
 import re
-import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +21,7 @@ from headway.errors import ConfigError, HeadwayError, one_line, unknown_name
 from headway.task import Task, env_action, episode_length, scaled_action, sim_param_sets, task_of
 from headway.training.check import compared, method_findings
 from headway.training.collect import Environments
-from headway.training.files import UNFINISHED, writing
+from headway.training.files import new_folder
 from headway.training.run import RunDir, trajectories_digest
 
 Data = str | Path | Iterable[Mapping[str, Any]]
@@ -76,30 +76,43 @@ def read_log(data: Data, config: Config, held_out: float, names: Mapping[str, st
     for found in method_findings(task):
         if found.status == "fault":
             raise ConfigError(f"{config.env}, {found.name}: {found.text}")
-    cutter = _Cutter(task, config)
+    tables: list[_Rows] = []
+    physics: list[dict[str, float]] = []
+    recordings: list[dict[str, Any]] = []
+    cuts: Counter[str] = Counter()
     for where, table in _tables(data):
-        cutter.cut(_Recording(where, table, names))
-    pieces = cutter.trajectories()
-    counts = {"gaps in time": cutter.gaps, "rows with missing numbers": cutter.missing}
-    cuts = " and ".join(f"{count} {what}" for what, count in counts.items() if count)
-    remarks = [f"cut at {cuts}: {len(cutter.files)} recordings, {len(pieces)} pieces."] * bool(cuts)
+        rows, known = _read(_Table(where, table, names), task, config, cuts)
+        tables.append(rows._replace(number=rows.number + len(physics)))
+        physics += known
+        for i in range(len(known)):
+            file = f"{where}, {i}" if len(known) > 1 else where
+            recordings.append({"file": file, "pieces": 0, "transitions": 0, "held_out": False})
+    cut_at = " and ".join(f"{count} {what}" for what, count in cuts.items() if count)
+    if not any(rows.valid.any() for rows in tables):
+        raise ConfigError(
+            f"{len(recordings)} recordings with {cut_at or 'no row'} have no transition, allowed:"
+            " complete rows in a row."
+        )
+    rows = _Rows(*map(np.concatenate, zip(*tables, strict=True)))
+    pieces = _pieces(rows, physics, task, episode_length(config))
+    remarks = []
+    if cut_at:
+        remarks.append(f"cut at {cut_at}: {len(recordings)} recordings, {len(pieces)} pieces.")
     for found in compared(task, pieces):
         if found.text and (found.name != "terminated" or any(piece.terminated for piece in pieces)):
             remarks.append(f"{found.name}: {found.text}")
-    of_recording = [int(piece.sim_params[RECORDING]) for piece in pieces]
-    several = len({*of_recording}) > 1  # else pieces of the only one are held out
-    units = of_recording if several else list(range(len(pieces)))
+    units = [int(piece.sim_params[RECORDING]) for piece in pieces]
+    alone = len({*units}) == 1  # then pieces of the only recording are held out
+    units = range(len(pieces)) if alone else units
     order = np.random.default_rng(config.seed).permutation(np.unique(units))
-    out = order[: min(max(round(held_out * len(order)), held_out > 0), len(order) - 1)].tolist()
-    recordings = [
-        {"file": where, "pieces": 0, "transitions": 0, "held_out": several and number in out}
-        for number, where in enumerate(cutter.files)
-    ]
+    out = order[: min(max(round(held_out * len(order)), held_out > 0), len(order) - 1)]
     parts: tuple[list[Trajectory], list[Trajectory]] = [], []
-    for number, unit, piece in zip(of_recording, units, pieces, strict=True):
+    for unit, piece in zip(units, pieces, strict=True):
         parts[unit in out].append(piece)
-        recordings[number]["pieces"] += 1
-        recordings[number]["transitions"] += len(piece)
+        recording = recordings[int(piece.sim_params[RECORDING])]
+        recording["pieces"] += 1
+        recording["transitions"] += len(piece)
+        recording["held_out"] = not alone and unit in out
     log = {
         "data": Path(data).name if isinstance(data, str | Path) else "arrays",
         "rounds": config.collection.num_iterations,
@@ -111,14 +124,18 @@ def read_log(data: Data, config: Config, held_out: float, names: Mapping[str, st
 
 def _task(config: Config) -> Task:
     """The Task, told the spaces of its environment, or those that it states where none is made."""
-    one = {"collection.num_episodes": 1, "collection.env_processes": False}
     try:
-        with closing(Environments.make(override(config, one))) as environments:
-            return environments.task
+        with closing(_environment(config)) as environment:
+            return environment.task
     except HeadwayError:
         with suppress(AttributeError):
             return task_of(dataclasses.replace(config, spaces=task_of(config).spaces))
         raise
+
+
+def _environment(config: Config) -> Environments:
+    one = {"collection.num_episodes": 1, "collection.env_processes": False}
+    return Environments.make(override(config, one))
 
 
 @contextmanager
@@ -141,9 +158,10 @@ def _tables(data: Data) -> Iterator[tuple[str, Mapping[str, Any]]]:
         return
     path = Path(data)
     if str(data).startswith("minari:") or (path / "data" / "metadata.json").exists():
-        yield from _minari(str(data))
+        with _reading(data):
+            yield from _minari(str(data))
         return
-    files = [file for file in (path, *sorted(path.rglob("*"))) if file.suffix in READERS]
+    files = [one for one in (path, *sorted(path.rglob("*"))) if one.suffix in (".npz", ".parquet")]
     if not files:
         raise ConfigError(
             f"{data} holds no recordings, allowed: an .npz or .parquet file, a folder of them, a"
@@ -151,13 +169,9 @@ def _tables(data: Data) -> Iterator[tuple[str, Mapping[str, Any]]]:
         )
     for file in files:
         with _reading(file):
-            table = READERS[file.suffix](file)
+            # NumPy unpickles nothing unless it is told to.
+            table = dict(np.load(file)) if file.suffix == ".npz" else _parquet(file)
         yield str(file), table
-
-
-def _npz(file: Path) -> Mapping[str, Any]:
-    with np.load(file) as arrays:  # never unpickles
-        return dict(arrays)
 
 
 def _parquet(file: Path) -> Mapping[str, Any]:
@@ -175,80 +189,74 @@ def _parquet(file: Path) -> Mapping[str, Any]:
     return {name: array(table[name]) for name in table.column_names}
 
 
-READERS = {".npz": _npz, ".parquet": _parquet}
-
-
 def _minari(data: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    with _reading(data):
-        import h5py  # noqa: F401 (Minari looks for it only as it reads)
-        import minari
+    import h5py  # noqa: F401 (Minari looks for it only as it reads)
+    import minari
+    from gymnasium.spaces import flatten
+    from gymnasium.vector.utils import batch_space, iterate
 
-        name = data.removeprefix("minari:")
-        local = name == data
-        found = minari.MinariDataset(Path(data) / "data") if local else minari.load_dataset(name)
-        for episode in found.iterate_episodes():
-            physics = episode.infos.get("sim_params", {})
-            yield (
-                f"{data}, episode {episode.id}",
-                {
-                    "obs": _flat(episode.observations, found.observation_space),
-                    "action": episode.actions,
-                    "reward": episode.rewards,
-                    "terminated": episode.terminations,
-                    "truncated": episode.truncations,
-                    **{PHYSICS + name: values for name, values in physics.items()},
-                },
-            )
-
-
-def _flat(values: Any, space: Any) -> Any:
-    """Observations in one row each, in the order of `FlattenObservation`."""
-    if not isinstance(values, Mapping):
-        return values
-    parts = [np.asarray(_flat(values[name], space[name])) for name in space]
-    return np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
+    name = data.removeprefix("minari:")
+    local = name == data
+    found = minari.MinariDataset(Path(data) / "data") if local else minari.load_dataset(name)
+    space = found.observation_space
+    for episode in found.iterate_episodes():
+        rows = iterate(batch_space(space, len(episode.rewards) + 1), episode.observations)
+        table = {
+            "obs": [flatten(space, row) for row in rows],
+            "action": episode.actions,
+            "reward": episode.rewards,
+            "terminated": episode.terminations,
+            "truncated": episode.truncations,
+        }
+        physics = episode.infos.get("sim_params", {})
+        table |= {PHYSICS + name: values for name, values in physics.items()}
+        yield f"{data}, episode {episode.id}", table
 
 
 @dataclasses.dataclass
-class _Recording:
-    """A table, where it stands, and what its user calls things."""
+class _Table:
+    """Arrays, where they stand, and what their user calls them."""
 
     where: str
-    table: Mapping[str, Any]
+    arrays: Mapping[str, Any]
     names: Mapping[str, str]
 
-    def numbers(self, name: str) -> np.ndarray | None:
-        """The numbers that it holds by one of our names [row, number]; None if there are none."""
-        near = [one for one in (name, *ALIASES.get(name, "").split()) if one in self.table][:1]
-        parts = near or [one for one in self.table if one.startswith(f"{name}.")]
+    def numbers(self, name: str, size: int = 1) -> np.ndarray:
+        """The numbers by one of our names [row, size]; no rows where it holds none."""
+        usual = (name, *ALIASES.get(name, "").split())
+        parts = [one for one in usual if one in self.arrays][:1]
         if name in self.names:
             parts = self.names[name].split(",")
-        absent = [part for part in parts if part not in self.table]
+        absent = [part for part in parts if part not in self.arrays]
         if absent or (not parts and name in ("obs", "action")):
             raise ConfigError(
                 f"{self.where} has no {', '.join(absent) or name}, allowed:"
-                f" {', '.join(self.table)}; choose by --names {name}=NAME or {name}=NAME,NAME."
+                f" {', '.join(self.arrays)}; choose by --names {name}=NAME or {name}=NAME,NAME."
             )
         if not parts:
-            return None
-        columns = [np.atleast_1d(np.asarray(self.table[part])) for part in parts]
-        values = np.concatenate([column.reshape(len(column), -1) for column in columns], axis=1)
-        if name == "episode":  # texts are fine
-            values = np.unique(values.astype(str), return_inverse=True)[1].reshape(len(values), 1)
-        if name == "time" and values.dtype.kind == "M":
-            values = (values - values[0]) / np.timedelta64(1, "s")
-        if values.dtype.kind not in "fiub":
-            what = f"{', '.join(parts)} is of type {values.dtype}"
-            raise ConfigError(f"{self.where}: {what}, allowed: numbers.")
-        return values.astype(np.float64)
+            return np.zeros((0, size))
+        with _reading(f"{self.where}: {name}"):
+            columns = [np.atleast_1d(self.arrays[part]) for part in parts]
+            values = np.concatenate([column.reshape(len(column), -1) for column in columns], axis=1)
+            if name == "episode":  # texts are fine
+                values = np.unique(values.astype(str), return_inverse=True)[1].reshape(-1, 1)
+            if values.dtype.kind == "M":
+                values = (values - values[0]) / np.timedelta64(1, "s")
+            values = values.astype(np.float64)
+        if values.shape[1] != size:
+            raise ConfigError(
+                f"{self.where}: a row of {name} has {values.shape[1]} numbers, allowed: {size};"
+                f" choose by --names {name}=NAME or {name}=NAME,NAME."
+            )
+        return values
 
-    def column(self, name: str, rows: int, default: float = 0.0) -> np.ndarray:
+    def column(self, name: str, rows: int, default: Any = 0.0) -> np.ndarray:
         """A number for each row, or one for all; of the last row nothing need be said.
 
         One that says how an episode ended is of the last action.
         """
-        values = self.numbers(name)
-        values = np.array([default]) if values is None else values[:, 0]
+        found = self.numbers(name)
+        values = found[:, 0] if len(found) else np.atleast_1d(default)
         if len(values) == 1:
             last = name in ("terminated", "truncated")
             return np.where(np.arange(rows) >= last * (rows - 2), values, 0.0)
@@ -261,129 +269,101 @@ class _Recording:
         return values
 
 
-@dataclasses.dataclass
-class _Cutter:
-    """Cuts recordings into pieces that have no gap and are no longer than an episode."""
+class _Rows(NamedTuple):
+    """Rows of tables, one below the other; the last one of each table begins no transition."""
 
-    task: Task
-    config: Config
-    pieces: list[dict[str, Any]] = dataclasses.field(default_factory=list)
-    """Fields of a `Trajectory` each; rewards that are missing are NaN."""
-    files: list[str] = dataclasses.field(default_factory=list)
-    """Of each recording."""
-    gaps: int = 0
-    missing: int = 0
-    """Rows that lack a number."""
+    obs: np.ndarray
+    action: np.ndarray
+    """In [-1, 1]."""
+    reward: np.ndarray
+    """NaN where it is missing."""
+    terminated: np.ndarray
+    valid: np.ndarray
+    """A transition begins here."""
+    number: np.ndarray
+    """Of the recording; a table may hold several."""
 
-    def trajectories(self) -> list[Trajectory]:
-        """All pieces; rewards that are missing are the Task's."""
-        if not self.pieces:
-            raise ConfigError(
-                f"{len(self.files)} recordings with {self.missing} rows that lack a number and"
-                f" {self.gaps} gaps in time have no transition, allowed: complete rows in a row."
-            )
-        rows = [(one["obs"][:-1], one["action"], one["obs"][1:]) for one in self.pieces]
-        obs, action, after = (jnp.concatenate(column) for column in zip(*rows, strict=True))
-        own = self.task.reward(obs, self.task.scale_action(action), after)
-        ends = np.cumsum([len(one["action"]) for one in self.pieces])[:-1]
-        for piece, due in zip(self.pieces, np.split(np.asarray(own), ends), strict=True):
-            piece["reward"] = np.where(np.isnan(piece["reward"]), due, piece["reward"])
-        return [Trajectory(**piece) for piece in self.pieces]
 
-    def cut(self, recording: _Recording) -> None:
-        """Cut a table, which may hold several recordings one after the other."""
-        obs, action = self.rows(recording)
-        rows = len(obs)
-        last_known = len(action) == rows - 1  # else a row that ends says not what followed
-        action = action[: rows - 1]
-        physics = self.physics(recording, rows)
-        other = np.zeros(rows - 1, bool)
-        for values in (recording.column("episode", rows), *physics.values()):
-            other |= np.diff(np.nan_to_num(values)) != 0
-        gap = np.zeros(rows - 1, bool)
-        if recording.numbers("time") is not None:
-            period = np.diff(recording.column("time", rows))
-            other |= period <= 0
-            usual = np.median(period[period > 0]) if (period > 0).any() else np.nan
-            gap = ~other & ~(np.abs(period / usual - 1) <= JITTER)
-        terminated, truncated = (
-            np.nan_to_num(recording.column(name, rows))[:-1].astype(bool)
-            for name in ("terminated", "truncated")
+def _read(
+    table: _Table, task: Task, config: Config, cuts: Counter[str]
+) -> tuple[_Rows, list[dict[str, float]]]:
+    """The rows of a table, and the physics of each recording in it; counts why it is cut."""
+    low, high = np.array(task.spaces.action_low), np.array(task.spaces.action_high)
+    obs, action = table.numbers("obs", task.spaces.obs_size), table.numbers("action", len(low))
+    rows, more = len(obs), len(obs) - len(action)
+    if rows < 2 or more not in (0, 1):
+        raise ConfigError(
+            f"{table.where} has {rows} obs and {len(action)} actions, allowed: as many of both, or"
+            " one obs more; at least 2 obs."
         )
-        ends = terminated | truncated
-        known, taken = (np.all(np.isfinite(values), axis=1) for values in (obs, action))
-        self.gaps += int(gap.sum())
-        self.missing += int((~known).sum() + (~taken).sum())
-        valid = known[:-1] & known[1:] & taken & ~other & ~gap & (last_known | ~ends)
-        number = len(self.files) + np.cumsum(np.append(0, other | ends))
-        reward = recording.column("reward", rows, np.nan)
-        action = self.scaled(recording, action, valid)
-        cuts = np.flatnonzero(~valid[1:] | ~valid[:-1] | ends[:-1]) + 1
-        longest = episode_length(self.config)
-        for run in np.split(np.arange(rows - 1), cuts):
-            for part in (
-                np.split(run, range(longest, len(run), longest)) if valid[run].all() else ()
-            ):
-                told = {name: float(values[part[0]]) for name, values in physics.items()}
-                self.pieces.append(
-                    {
-                        "obs": obs[part[0] : part[-1] + 2],
-                        "action": action[part],
-                        "reward": reward[part],
-                        "sim_params": {**told, RECORDING: float(number[part[0]])},
-                        "terminated": bool(terminated[part[-1]]),
-                    }
+    with np.errstate(over="ignore"):  # what becomes infinite is missing
+        obs = obs.astype(np.float32)
+    action = np.append(action[: rows - 1], low[None], axis=0)
+    known = [PHYSICS + name for name in sim_param_sets(config).names]
+    columns = {name: table.column(name, rows) for name in table.arrays if name.startswith(PHYSICS)}
+    for name in columns:
+        if name not in known:
+            raise unknown_name(f"simulator parameter in {table.where},", name, known)
+    period = np.diff(table.column("time", rows, np.arange(rows)), append=np.nan)
+    other = period <= 0  # the next row is of another recording, as after the last one
+    for values in (table.column("episode", rows), *columns.values()):
+        other |= np.diff(np.nan_to_num(values), append=np.nan) != 0
+    usual = np.median(period[period > 0]) if (period > 0).any() else np.nan
+    gap = ~other & ~(np.abs(period / usual - 1) <= JITTER)
+    terminated, truncated = (
+        np.nan_to_num(table.column(name, rows)).astype(bool) for name in ("terminated", "truncated")
+    )
+    ends = terminated | truncated
+    seen = np.isfinite(obs).all(1)
+    lacking = ~(seen & np.isfinite(action).all(1))
+    cuts.update({"gaps in time": int(gap.sum()), "rows with missing numbers": int(lacking.sum())})
+    valid = ~(lacking | other | gap) & np.roll(seen, -1)
+    if not more:  # nothing says what followed an end
+        valid &= ~ends
+    action = np.where(valid[:, None], action, low)
+    taken = env_action(task, scaled_action(task, action)).reshape(action.shape)
+    for row, entry in np.argwhere(np.abs(action - taken) > ROUNDING * (high - low))[:1]:
+        raise ConfigError(
+            f"{table.where}: action[{entry}] is {action[row, entry]:g} in row {row}, allowed:"
+            f" {low[entry]:g} to {high[entry]:g}, as {config.env} takes it; mend the recording, or"
+            " the bounds."
+        )
+    number = np.cumsum(np.append(False, (other | ends)[:-1]))
+    physics = [
+        {
+            name.removeprefix(PHYSICS): float(values[np.searchsorted(number, one)])
+            for name, values in columns.items()
+            if np.isfinite(values).all()
+        }
+        for one in range(1 + number[-2])
+    ]
+    action = scaled_action(task, taken.astype(np.float64))
+    reward = table.column("reward", rows, np.nan)
+    return _Rows(obs, action, reward, terminated, valid, number), physics
+
+
+def _pieces(
+    rows: _Rows, physics: Sequence[Mapping[str, float]], task: Task, longest: int
+) -> list[Trajectory]:
+    """Cut rows into trajectories without a gap; rewards that are missing are the Task's."""
+    obs = jnp.asarray(rows.obs)
+    own = task.reward(obs[:-1], task.scale_action(jnp.asarray(rows.action[:-1])), obs[1:])
+    reward = np.where(np.isnan(rows.reward[:-1]), own, rows.reward[:-1])
+    pieces = []
+    cuts = np.flatnonzero(np.diff(rows.valid) | (np.diff(rows.number) != 0)) + 1
+    for run in np.split(np.arange(len(obs)), cuts):
+        for part in np.split(run, range(longest, len(run), longest)):
+            if rows.valid[part[0]]:
+                number = int(rows.number[part[0]])
+                piece = Trajectory(
+                    obs=rows.obs[part[0] : part[-1] + 2],
+                    action=rows.action[part],
+                    reward=reward[part],
+                    sim_params={**physics[number], RECORDING: float(number)},
+                    terminated=bool(rows.terminated[part[-1]]),
                 )
-        found = 1 + number[-2] - len(self.files)
-        several = [f"{recording.where}, {i}" for i in range(found)]
-        self.files += several if found > 1 else [recording.where]
-
-    def rows(self, recording: _Recording) -> tuple[np.ndarray, np.ndarray]:
-        """Observations and actions by row, of the right sizes."""
-        read = {}
-        spaces = self.task.spaces
-        for name, size in (("obs", spaces.obs_size), ("action", len(spaces.action_low))):
-            read[name] = np.asarray(recording.numbers(name))
-            if read[name].shape[1] != size:
-                raise ConfigError(
-                    f"{recording.where}: a row of {name} has {read[name].shape[1]} numbers,"
-                    f" allowed: {size}, as {self.config.env} has; choose by --names {name}=NAME,..."
-                )
-        obs, action = read.values()
-        if len(obs) < 2 or len(obs) - len(action) not in (0, 1):
-            raise ConfigError(
-                f"{recording.where} has {len(obs)} obs and {len(action)} actions, allowed: as many"
-                " of both, or one obs more; at least 2 obs."
-            )
-        with np.errstate(over="ignore"):  # what becomes infinite is missing
-            return obs.astype(np.float32), action
-
-    def physics(self, recording: _Recording, rows: int) -> dict[str, np.ndarray]:
-        """The physics that a recording names, by row."""
-        named = [name for name in recording.table if name.startswith(PHYSICS)]
-        known = sim_param_sets(self.config).names
-        for name in named:
-            if name.removeprefix(PHYSICS) not in known:
-                what = f"simulator parameter in {recording.where},"
-                raise unknown_name(what, name, [PHYSICS + one for one in known])
-        columns = {name.removeprefix(PHYSICS): recording.column(name, rows) for name in named}
-        return {name: values for name, values in columns.items() if np.isfinite(values).all()}
-
-    def scaled(self, recording: _Recording, action: np.ndarray, valid: np.ndarray) -> np.ndarray:
-        """Actions in [-1, 1]; those that the environment cannot take are refused."""
-        spaces = self.task.spaces
-        low, high = np.array(spaces.action_low), np.array(spaces.action_high)
-        within = np.clip(action, low, high)
-        if spaces.action_kind != "box":
-            within = np.rint(within)
-        off = valid[:, None] & (np.abs(action - within) > ROUNDING * (high - low))
-        for row, entry in np.argwhere(off)[:1]:
-            raise ConfigError(
-                f"{recording.where}: action[{entry}] is {action[row, entry]:g} in row {row},"
-                f" allowed: {low[entry]:g} to {high[entry]:g}, as {self.config.env} takes it; mend"
-                " the recording, or the bounds."
-            )
-        return scaled_action(self.task, within)
+                pieces.append(piece)
+    return pieces
 
 
 def export_data(run_dir: str | Path, out: str | Path) -> int:
@@ -413,9 +393,8 @@ def export_data(run_dir: str | Path, out: str | Path) -> int:
             f"{run_dir} has {len(episodes)} episodes and is exported to {out}, allowed: some, and a"
             " folder that is not there yet, with a version at its end, as pendulum-v0."
         )
-    one = override(config, {"collection.num_episodes": 1, "collection.env_processes": False})
-    with closing(Environments.make(one)) as environments:
-        task, vector = environments.task, environments.vector
+    with closing(_environment(config)) as environment:
+        task, vector = environment.task, environment.vector
     buffers = []
     for episode in episodes:
         last = np.arange(len(episode)) == len(episode) - 1
@@ -430,15 +409,12 @@ def export_data(run_dir: str | Path, out: str | Path) -> int:
             "infos": {"sim_params": told} if told else {},
         }
         buffers.append(EpisodeBuffer(**fields))
-    made = out.with_name(f".{out.name}{UNFINISHED}")
-    shutil.rmtree(made, ignore_errors=True)
-    with writing(out):
-        made.mkdir(parents=True)
+    with new_folder(out) as folder:
+        folder.mkdir(parents=True)
         spaces = vector.single_observation_space, vector.single_action_space
-        storage = MinariStorage.new(made / "data", *spaces)
+        storage = MinariStorage.new(folder / "data", *spaces)
         text = f"Collected by headway: {config.method} on {config.env}, seed {config.seed}."
         facts = {"dataset_id": out.name, "minari_version": minari.__version__, "description": text}
         storage.update_metadata(facts | {"algorithm_name": config.method})
         storage.update_episodes(buffers)
-        made.rename(out)
     return len(episodes)

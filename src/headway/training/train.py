@@ -29,7 +29,7 @@ from headway.training.collect import (
     random_policy,
 )
 from headway.training.evaluate import Tests, iteration_keys, run_tests
-from headway.training.files import UNFINISHED, tree_arrays, tree_from_arrays, writing
+from headway.training.files import new_folder, tree_arrays, tree_from_arrays
 from headway.training.progress import Progress
 from headway.training.recordings import HELD_OUT, Log
 from headway.training.run import LOCK, RunDir
@@ -100,8 +100,7 @@ def train_run(
                 if good is None
                 else f"goes on after iteration {good}, which is intact"
             )
-        made = nullcontext() if log else closing(Environments.make(config))
-        with made as environments:
+        with nullcontext() if log else closing(Environments.make(config)) as environments:
             if environments:
                 config = dataclasses.replace(config, spaces=environments.task.spaces)
             run.begin(config)
@@ -131,12 +130,9 @@ def continued(run_dir: str | Path) -> Config:
 def copy_run(run_dir: Path, to: Path) -> None:
     """Copy a run, to go on with the copy; where there is something already, that is kept."""
     if not to.exists():
-        unfinished = to.with_name(f".{to.name}{UNFINISHED}")
-        shutil.rmtree(unfinished, ignore_errors=True)
-        with writing(to):
+        with new_folder(to) as folder:
             left = shutil.ignore_patterns("partial", "figures", LOCK)
-            shutil.copytree(run_dir, unfinished, ignore=left)
-            unfinished.rename(to)
+            shutil.copytree(run_dir, folder, ignore=left)
 
 
 @dataclasses.dataclass
@@ -167,10 +163,9 @@ class _Training:
             metrics: dict[str, Any] = {"iteration": iteration}
             collected: list[Trajectory] = []
             seconds = {}
-            if self.log:
-                collected = [] if iteration else self.log.fitted
-                metrics |= {} if iteration else {"recordings": self.log.recordings}
-            elif config.model.learns:
+            if self.log and not iteration:
+                collected, metrics["recordings"] = self.log.fitted, self.log.recordings
+            elif self.environments and config.model.learns:
                 rounds = self.collect(collect_key)
                 collected = [one for rollout in rounds for one in rollout.episodes.values()]
                 seconds["collect"] = sum(rollout.seconds for rollout in rounds)
@@ -347,7 +342,12 @@ class _Training:
             "transitions": sum(map(len, self.data)),
         }
         batches, steps = self.trainer.num_batches(self.data), measured["transitions"]
-        if batches < FEW_BATCHES and 2 * steps < len(self.data) * self.environments.episode_length:
+        environments = self.environments
+        if (
+            environments
+            and batches < FEW_BATCHES
+            and 2 * steps < len(self.data) * environments.episode_length
+        ):
             warnings.warn(
                 f"{self.config.env}, iteration {iteration}: {steps} transitions make {batches}"
                 f" batches (fitting.batch_size {self.config.fitting.batch_size}), too few to learn"
