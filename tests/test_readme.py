@@ -195,12 +195,22 @@ PAGES = [
 def test_options_that_the_pages_show_exist(command, capsys):
     with pytest.raises(SystemExit):
         main([command, "--help-all"])
-    offered = set(re.findall(r"--[a-z][\w.-]*\w", capsys.readouterr().out))
+    offered = {"--help-all", *re.findall(r"--[a-z][\w.-]*\w", capsys.readouterr().out)}
     for page in PAGES:
         text = re.sub(r"\\\n\s*", " ", page.read_text())
         for shown in re.findall(rf"headway {command} ([^`\n#]*)", text):
             unknown = set(re.findall(r"--[a-z][\w.-]*\w", shown)) - offered
             assert not unknown, f"{page.name} shows headway {command} with {unknown}"
+
+
+def test_messages_that_are_explained_exist():
+    source = "".join(path.read_text() for path in (ROOT / "src").rglob("*.py"))
+    said = re.sub(r'"\s*\n\s*f?"', "", source)  # texts over several lines
+    explained = re.findall(r"^\| `(.+?)`", (ROOT / "docs/faq.md").read_text(), re.MULTILINE)
+    assert len(explained) > 8
+    for message in explained:
+        for part in re.split(r"\d+|…", message):
+            assert part.strip() in said, message
 
 
 def test_settings_that_the_pages_name_exist():

@@ -525,9 +525,9 @@ class Serve(_OfRun):
         settings = self.changed(self.config())
         from headway.service.serve import serve
 
-        def ready(facts: Mapping[str, Any]) -> None:
-            text = f"{self.run_dir} at {facts['url']}, {self.deadline_ms:g} ms per answer; Ctrl-C"
-            self.show(facts, f"{text} stops.")
+        def ready(url: str) -> None:
+            text = f"{self.run_dir} at {url}, {self.deadline_ms:g} ms per answer; Ctrl-C stops."
+            self.show({"url": url}, text)
             sys.stdout.flush()
 
         names = ("deadline_ms", "host", "port", "max_robots", "silence_s", "iteration")

@@ -3,6 +3,7 @@
 import difflib
 import reprlib
 from collections.abc import Iterable
+from importlib.util import find_spec
 from typing import Any
 
 _SHORT = reprlib.Repr()
@@ -90,3 +91,13 @@ def unknown_name(kind: str, got: str, allowed: Iterable[str]) -> UnknownNameErro
         return UnknownNameError(f"unknown {kind} {shown(got)}. There is none; leave it out.")
     hint = did_you_mean(got, names)
     return UnknownNameError(f"unknown {kind} {shown(got)}.{hint} Allowed: {', '.join(names[:99])}.")
+
+
+def needs(extra: str, *packages: str) -> None:
+    """Make sure that the packages of an extra are installed, before anything is begun.
+
+    Raises:
+        ConfigError: One is not.
+    """
+    if missing := [name for name in packages if not find_spec(name)]:
+        raise ConfigError(f"{', '.join(missing)} not installed; pip install 'headway[{extra}]'.")

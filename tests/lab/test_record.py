@@ -2,7 +2,6 @@
 
 import functools
 import io
-from types import SimpleNamespace
 
 import imageio.v3 as iio
 import numpy as np
@@ -15,8 +14,8 @@ from headway.config import PlannerConfig
 from headway.envs import ClassicVectorEnv
 from headway.errors import BadEnvironmentError, ConfigError, HeadwayError
 from headway.lab import record as lab
-from headway.lab.figures import HEADS, INK
-from headway.lab.record import MARGIN, WIDTH, Recording, film
+from headway.lab.figures import FAINT, HEADS, INK
+from headway.lab.record import LINE, MARGIN, TRACE, WIDTH, Recording, film
 from headway.planning.agent import Agent
 from headway.sim_params import SimParamSets, Uniform
 from headway.task import EnvSpec, register, task_of
@@ -27,11 +26,12 @@ from headway.worlds.classic import PendulumTask
 SCENE = (240, 320)
 
 
-def moment(step, length=1.0, heads=(0, 1)):
+def moment(step, length=1.0, heads=(0, 1), action=(0.5,), reward=-1.0):
     image = np.full((*SCENE, 3), 250, np.uint8)
     image[step % 200 : step % 200 + 4] = (200, 40, 40)
     chosen = None if heads is None else np.array(heads)
-    return SimpleNamespace(image=image, sim_params={"length": length}, reward=-1.0, heads=chosen)
+    physics = {"length": length}
+    return lab.Moment(image, physics, np.array(action), reward, chosen)
 
 
 def frames(content):
@@ -85,9 +85,21 @@ def test_strips_show_who_planned_until_now():
 def test_a_line_marks_where_the_physics_changed():
     steps = [moment(i, length=1.0 if i < 5 else 0.5) for i in range(10)]
     last = frames(film(steps, 20.0, ".gif"))[-1][0]
-    strips = last[-MARGIN - 15 : -MARGIN]
-    columns = near(strips, INK)[1]
-    assert np.median(columns) == pytest.approx(WIDTH / 2, abs=3)
+    dark = len(last) - WIDTH * SCENE[0] // SCENE[1]  # below the scene
+    columns, counts = np.unique(near(last[-dark:], INK)[1], return_counts=True)
+    assert columns[counts.argmax()] == pytest.approx(WIDTH / 2, abs=3)
+
+
+def test_traces_show_actions_and_rewards_until_now():
+    up = [moment(i, heads=None, action=(i / 9, -i / 9), reward=float(i)) for i in range(10)]
+    shown = [frame for frame, _ in frames(film(up, 20.0, ".gif"))]
+    bottom = WIDTH * SCENE[0] // SCENE[1] + MARGIN + LINE  # below the scene and its caption
+    rows, columns = near(shown[-1][bottom:], INK)
+    for trace in (rows < rows.max() - TRACE, rows >= rows.max() - TRACE):  # an action, the reward
+        heights = [rows[trace & (columns == x)].mean() for x in (WIDTH // 4, WIDTH // 2)]
+        assert heights[1] < heights[0] - TRACE / 8
+    assert near(shown[-1][bottom:], FAINT)[1].max() > WIDTH * 0.9  # the other action
+    assert near(shown[4][bottom:], INK)[1].max() < WIDTH * 0.6
 
 
 def test_without_heads_there_are_no_strips():

@@ -160,5 +160,5 @@ def test_a_missing_extra_is_one_clear_line():
     done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
     assert done.returncode == 1
     assert "pandas not installed" in done.stderr
-    assert done.stderr.strip().endswith("pip install headway[lab].")
+    assert done.stderr.strip().endswith("pip install 'headway[lab]'.")
     assert done.stderr.count("\n") == 1

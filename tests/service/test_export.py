@@ -148,7 +148,7 @@ def test_what_cannot_be_exported_is_refused(tmp_path, reference, monkeypatch):
         headway.export(reference, tmp_path)
     with pytest.raises(RunError, match="is not a directory"):
         headway.export(tmp_path / "none", tmp_path / "a.headway")
-    monkeypatch.setattr("headway.service.find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"^flatbuffers is not .*'headway\[export\]'\.$"):
+    monkeypatch.setattr("headway.errors.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"^flatbuffers not installed; .*'headway\[export\]'\.$"):
         headway.export(reference, tmp_path / "a.headway")
     assert not [*tmp_path.iterdir()]

@@ -66,9 +66,10 @@ def test_what_is_pulled_is_the_run_that_was_pushed(data, target, reference, tmp_
         with pytest.raises(RunError, match=r"data/iteration-000\.safetensors is missing"):
             RunDir(pulled).check()
     card = huggingface_hub.ModelCard((pulled / "README.md").read_text())
-    scores = {entry.metric_name: entry.metric_value for entry in card.data.eval_results}
+    assert card.data.library_name == "headway"
     last = [row for row in RunDir(reference).evaluation() if row.iteration == 2]
-    assert scores["low, length=0.25 mass=1"] == round(last[2].episode_return, 3)
+    earned = f"{last[2].episode_return:,.1f} ± 0.0"
+    assert f"| low | length=0.25 mass=1 | 1 | {earned} |" in card.text
     assert f"headway pull {target} runs/pendulum-tmcl" in card.text
     assert "planner.horizon: 4 -> 3" in card.text
 
@@ -114,7 +115,9 @@ def test_what_is_not_pushed(target, reference, two_iterations, tmp_path):
         patch.setattr(huggingface_hub, "HfApi", FakeHub)
         for taken in (tmp_path / "damaged/data", other.path):
             refused("config.json is missing|holds another run", headway.push, reference, taken)
-        refused("is a file", headway.push, reference, reference / "config.json")
+        refused(
+            "cannot be written: File exists", headway.push, reference, reference / "config.json"
+        )
         shutil.copytree(tmp_path / "damaged/data", tmp_path / "hub/user/data")
         refused("holds no run", headway.push, reference, "hf://user/data")
     assert not (tmp_path / "pushed").exists()
@@ -142,7 +145,7 @@ def test_a_pulled_run_writes_nowhere_else(reference, target, tmp_path):
 
 
 def test_a_client_that_is_missing_and_heads_that_need_data(reference, tmp_path, monkeypatch):
-    monkeypatch.setattr("headway.service.find_spec", lambda name: None)
+    monkeypatch.setattr("headway.errors.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"'headway\[hub\]'"):
         headway.pull("hf://user/name", tmp_path / "a")
     values = json.loads((reference / "config.json").read_bytes())

@@ -19,6 +19,11 @@ from headway.training.recordings import export_data, read_log
 from headway.training.run import RunDir
 
 
+def register(name, env_id, make_task, sets):
+    own = {"name": name, "env_id": env_id, "make_task": make_task, "sim_params": sets}
+    headway.register(headway.EnvSpec(**own, episode_length=50, default_sim_params={"mass": 1.0}))
+
+
 @pytest.fixture
 def unchecked(monkeypatch):
     """Nothing is traced, which takes a second each time."""
@@ -197,11 +202,7 @@ def no_environment(**options):
 def test_a_task_is_enough_where_no_environment_can_be_made(monkeypatch):
     monkeypatch.setattr(task, "_registered", {})
     sets = headway.SimParamSets({"mass": [1.0]})
-    headway.register(
-        headway.EnvSpec(
-            name="push", env_id=no_environment, make_task=Push, sim_params=sets, episode_length=50
-        )
-    )
+    register("push", no_environment, Push, sets)
     log = read(
         [{"x": np.arange(9.0), "u": np.zeros(9)}], names={"obs": "x", "action": "u"}, env="push"
     )
@@ -221,11 +222,7 @@ class Pole(headway.Task):
 def test_categories_are_numbers_in_a_recording(monkeypatch):
     monkeypatch.setattr(task, "_registered", {})
     sets = headway.SimParamSets({"mass": [1.0]})
-    headway.register(
-        headway.EnvSpec(
-            name="pole", env_id="CartPole-v1", make_task=Pole, sim_params=sets, episode_length=50
-        )
-    )
+    register("pole", "CartPole-v1", Pole, sets)
     log = read([{"obs": np.zeros((4, 4)), "action": [0, 1, 1], "terminated": 1}], env="pole")
     np.testing.assert_array_equal(log.fitted[0].action, [[1, -1], [-1, 1], [-1, 1]])
     assert log.fitted[0].terminated

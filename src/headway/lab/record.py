@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import itertools
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -28,8 +29,9 @@ from headway.training.run import Iteration, RunDir
 from headway.training.trainers import load_agent
 
 FORMATS = (".gif", ".mp4")
-WIDTH, MARGIN, LINE, ROW, GAP = 480, 12, 18, 9, 2  # pixels
+WIDTH, MARGIN, LINE, ROW, GAP, TRACE = 480, 12, 18, 9, 2, 28  # pixels
 MAX_RATE = 25  # frames per second; a viewer shows hardly more of a GIF
+LIGHT = "#c4c4c4"
 LAST_FRAME = 1.5  # seconds that the end is seen
 
 
@@ -40,6 +42,8 @@ class Moment:
     image: UInt8[np.ndarray, "height width 3"]
     sim_params: Mapping[str, float]
     """The physics in force."""
+    action: np.ndarray
+    """The action that led here, in the environment's units."""
     reward: float
     heads: Int[np.ndarray, " member"] | None
     """The head that each member planned with; None where the model has no heads."""
@@ -120,7 +124,8 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
             with raising(config.env, f"step {step}"):
                 obs, reward, terminated, truncated, info = env.step(np.asarray(action)[None])
                 physics, image = _physics(info), made.frame()
-            moments.append(Moment(image, physics, float(reward[0]), controller.heads))
+            seen = Moment(image, physics, np.ravel(action), float(reward[0]), controller.heads)
+            moments.append(seen)
             shown.advance()
             if terminated[0] or truncated[0]:
                 break
@@ -175,17 +180,28 @@ def film(moments: Sequence[Moment], steps_per_second: float, suffix: str) -> byt
 
 
 def draw(moments: Sequence[Moment], shown: Sequence[int]) -> list[Image.Image]:
-    """Draw the pictures after some steps, above the heads that planned until then.
+    """Draw the pictures after some steps, above heads, actions and rewards until then.
 
-    A line through the strips marks where the physics changed.
+    A line through the strips marks where the physics changed. Traces reach from the least to the
+    largest value of the episode.
     """
     names = list(moments[0].sim_params)
     font, small = ImageFont.load_default(size=14), ImageFont.load_default(size=11)
     returns = np.cumsum([moment.reward for moment in moments])
     columns = np.linspace(MARGIN, WIDTH - MARGIN, len(moments) + 1).round().astype(int)
     members = 0 if moments[0].heads is None else len(moments[0].heads)
-    strips = Image.new("RGB", (WIDTH, members * (ROW + GAP) + 1), "white")
+    traces = {
+        "action": np.stack([moment.action for moment in moments], axis=1),
+        "reward": np.array([[moment.reward for moment in moments]]),
+    }
+    below = members * (ROW + GAP)
+    strips = Image.new("RGB", (WIDTH, below + len(traces) * (LINE + TRACE)), "white")
     pen = ImageDraw.Draw(strips)
+    for place, values in enumerate(traces.values(), start=1):
+        base, low = below + place * (LINE + TRACE) - GAP, values.min()
+        heights = base - (TRACE - 2 * GAP) * (values - low) / max(np.ptp(values), 1e-9)
+        for row, color in zip(heights.tolist(), itertools.cycle((INK, FAINT, LIGHT))):
+            pen.line([*zip(columns[1:].tolist(), row, strict=True)], color)
     for step, moment in enumerate(moments):
         left, right = int(columns[step]), int(columns[step + 1])
         for row, head in enumerate(() if moment.heads is None else moment.heads):
@@ -210,7 +226,11 @@ def draw(moments: Sequence[Moment], shown: Sequence[int]) -> list[Image.Image]:
         if members:
             caption = "head that each network of the ensemble planned with"
             pen.text((MARGIN, line + LINE), caption, FAINT, small, anchor="ls")
-            past = strips.crop((0, 0, int(columns[step + 1]), strips.height))
-            frame.paste(past, (0, line + LINE + MARGIN // 2))
+        past = strips.crop((0, 0, int(columns[step + 1]), strips.height))
+        top = line + LINE * bool(members) + MARGIN // 2
+        frame.paste(past, (0, top))
+        for place, name in enumerate(traces):
+            middle = top + below + place * (LINE + TRACE) + LINE // 2
+            pen.text((MARGIN, middle), name, FAINT, small, anchor="lm")
         frames.append(frame)
     return frames

@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import itertools
 import math
 import os
 import socket
@@ -11,19 +10,19 @@ import time
 import webbrowser
 from collections.abc import Callable
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from headway.config import OPTIMIZERS
-from headway.errors import BadEnvironmentError, ConfigError
+from headway.errors import BadEnvironmentError, ConfigError, needs
 from headway.play.player import LEARNING, REMEMBERED, Player
 from headway.sim_params import Uniform
 from headway.training.collect import raising
 from headway.worlds.classic import CartPoleSwingUp
-from headway.worlds.rendering import BODY, CART, HEADS, INK
+from headway.worlds.rendering import BODY, CART, GRID, HEADS, INK
 
 SHIPPED = Path(__file__).parent / "pendulum"
 """A trained run that ships with Headway: `headway train pendulum --preset quick --seed 0
@@ -33,7 +32,8 @@ FRAME_S, PLOT_S = 1 / 30, 1 / 5
 """Least time between two pictures of the scene, and of the plots."""
 PUSHES = {"push −": -2.0, "push +": 2.0}
 """Changes of a velocity (m/s or rad/s)."""
-SPEEDS = {"¼×": 0.25, "½×": 0.5, "1×": 1.0, "2×": 2.0, "4×": 4.0}
+COLORS = np.array([[*bytes.fromhex(f"{color[1:]}ff")] for color in HEADS], np.uint8)
+"""Those of heads, opaque."""
 
 Show = Callable[[Player], None]
 
@@ -53,30 +53,24 @@ def play(run_dir: str | Path | None = None, *, host: str = "127.0.0.1", port: in
         ConfigError: viser is not installed, or this machine has no such address.
         BadEnvironmentError: The environment cannot be made.
     """
-    if missing := [name for name in ("viser", "mjviser") if not find_spec(name)]:
-        raise ConfigError(
-            f"{', '.join(missing)} not installed, needed for headway play;"
-            " pip install 'headway[play]'."
-        )
+    needs("play", "viser", "mjviser")
     try:
         socket.create_server((host, 0)).close()
     except OSError as error:
         raise ConfigError(
-            f"host is {host!r} ({error.strerror}), allowed: an address of this machine, such as"
-            " 127.0.0.1 or 0.0.0.0."
+            f"host is {host!r} ({error.strerror}), allowed: an address of this machine."
         ) from None
     player = Player(run_dir or SHIPPED)
     try:
         page = Page(player, host, port)
         print(f"Open {page.address} (Ctrl-C ends)", file=sys.stderr, flush=True)
-        screens = map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))
-        if sys.platform != "linux" or any(screens):
+        if sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
             webbrowser.open(page.address)
         player.run(page.show)
     except KeyboardInterrupt:
         pass
     finally:
-        player.close()
+        player.environments.close()
 
 
 class Page:
@@ -113,11 +107,10 @@ class Page:
         with gui.add_folder("Clock"):
             clock = gui.add_button_group("episode", tuple(acts))
             clock.on_click(lambda _: player.ask(acts[clock.value]))
-            speed = gui.add_dropdown("speed", tuple(SPEEDS), initial_value="1×")
-            speed.on_update(
-                lambda _: player.ask(partial(setattr, player, "speed", SPEEDS[speed.value]))
-            )
-        self._strip = gui.add_html(self._heads())
+            speed = gui.add_slider("speed", 0.25, 4.0, 0.25, player.speed)
+            speed.on_update(lambda _: player.ask(partial(setattr, player, "speed", speed.value)))
+        nothing = np.zeros((1, 1, 4), np.uint8)
+        self._strip = gui.add_image(nothing, label="head that each network plans with")
         known = player.spec.obs_names
         names = [*known, *(f"obs[{i}]" for i in range(len(known), len(player.obs)))]
         self._entry = gui.add_dropdown("observation", names[: len(player.obs)])
@@ -185,7 +178,8 @@ class Page:
         self._status.content = self._words()
         if not moments:
             return
-        self._strip.content = self._heads()
+        if moments[-1].heads is not None:
+            self._strip.image = self._heads()
         entry, step = self._entry.options.index(self._entry.value), 1 / player.rate
         past = step * np.arange(1 - len(moments), 1)
         real = np.array([moment.obs[entry] for moment in moments])
@@ -208,28 +202,17 @@ class Page:
         words = "**paused**" if player.paused else words
         return f"{words} · reward {newest.reward:.2f}\n\n{player.message}"
 
-    def _heads(self) -> str:
-        """A strip per network, coloured by its chosen head; a line where physics changed."""
-        moments, parts = list(self.player.moments), []
-        first = REMEMBERED - len(moments)
-        members = list(zip(*(m.heads for m in moments if m.heads is not None), strict=True))
-        for row, heads in enumerate(members):
-            at = first
-            for head, same in itertools.groupby(heads):
-                long, color = len(list(same)), HEADS[int(head) % len(HEADS)]
-                parts.append(f'<rect x="{at}" y="{10 * row}" width="{long}" fill="{color}"/>')
-                at += long
-        for at, moment in enumerate(moments, first):
-            if moment.changed:
-                parts.append(f'<rect x="{at}" width="1" style="height: 100%"/>')
-        rows = len(members)
-        return (
-            "<style>.heads rect { height: 7px }</style>"
-            '<div style="padding: 0 0.6em"><small>head that each network plans with</small>'
-            f'<svg class="heads" viewBox="0 0 {REMEMBERED} {10 * rows}" preserveAspectRatio="none"'
-            f' shape-rendering="crispEdges" style="width: 100%; height: {16 * rows}px">'
-            f"{''.join(parts)}</svg></div>"
-        )
+    def _heads(self) -> UInt8[np.ndarray, "height width 4"]:
+        """A row per network, coloured by its chosen head; dark where physics changed."""
+        moments = list(self.player.moments)
+        heads = np.array([moment.heads for moment in moments]).T
+        image = np.zeros((len(heads), REMEMBERED, 4), np.uint8)
+        recent = image[:, REMEMBERED - len(moments) :]
+        recent[:] = COLORS[heads % len(COLORS)]
+        recent[:, [moment.changed for moment in moments]] = (*INK, 255)
+        image = image.repeat(8, 0).repeat(4, 1)
+        image[7::8] = 0  # between two networks
+        return image
 
 
 def _scene(server: Any, player: Player) -> Show:
@@ -241,22 +224,19 @@ def _scene(server: Any, player: Player) -> Show:
         return _robot(server, player)
 
     def show(player: Player) -> None:
-        with raising(player.spec.name, "a picture"):
-            image = player.environments.frame()
-        server.scene.set_background_image(image, format="jpeg")
+        try:
+            with raising(player.spec.name, "a picture"):
+                server.scene.set_background_image(player.environments.frame(), format="jpeg")
+        except BadEnvironmentError as error:  # it cannot be drawn
+            player.message = str(error)
 
-    try:
-        show(player)
-    except BadEnvironmentError as error:  # it cannot be drawn
-        player.message = str(error)
-        return lambda player: None
+    show(player)
     return show
 
 
 def _flat(server: Any, distance: float) -> Any:
     """A scene seen from the front, with lights that a browser without a GPU can draw."""
     server.initial_camera.position = (0.0, -distance, 0.0)
-    server.initial_camera.look_at = (0.0, 0.0, 0.0)
     server.scene.configure_environment_map(None)
     server.scene.configure_default_lights(cast_shadow=False)
     server.scene.add_light_ambient("/light", intensity=2.0)
@@ -273,11 +253,10 @@ def _pendulum(server: Any) -> Show:
     scene.add_box("/mount", color=INK, dimensions=(0.06, 0.3, 0.06))
     arm = scene.add_frame("/arm", show_axes=False)
     rod = scene.add_box("/arm/rod", color=BODY, dimensions=(depth, depth, 1.0))
+    turn = np.linspace(0, 2 * np.pi, 65)
+    circle = np.stack([np.sin(turn), 0 * turn, np.cos(turn)], 1)
     for length in (0.5, 1.0, 1.5):
-        ring = np.linspace(0, 2 * np.pi, 65)
-        points = length * np.stack([np.sin(ring), 0 * ring, np.cos(ring)], 1)
-        lines = np.stack([points[:-1], points[1:]], 1).astype(np.float32)
-        scene.add_line_segments(f"/ring{length}", lines, colors=(205, 208, 206))
+        scene.add_spline_catmull_rom(f"/ring{length}", length * circle, segments=64, color=GRID)
 
     def show(player: Player) -> None:
         length = player.sim_params["length"]
@@ -289,7 +268,7 @@ def _pendulum(server: Any) -> Show:
 
 def _cart_pole(server: Any) -> Show:
     scene, length = _flat(server, 5.0), CartPoleSwingUp.pole_length
-    scene.add_box("/track", color=(205, 208, 206), dimensions=(4.8, 0.05, 0.02))
+    scene.add_box("/track", color=GRID, dimensions=(4.8, 0.05, 0.02))
     cart = scene.add_box("/cart", color=CART, dimensions=(0.4, 0.2, 0.2))
     pole = scene.add_frame("/pole", show_axes=False)
     rod = scene.add_box("/pole/rod", color=BODY, dimensions=(0.07, 0.07, length))
@@ -310,7 +289,6 @@ def _robot(server: Any, player: Player) -> Show:
 
     (model,), (data,) = player.env.models, player.env.datas
     server.initial_camera.position = (0.0, -player.env.world.camera[0], 0.4)
-    server.initial_camera.look_at = (0.0, 0.0, 0.0)
     robot, looks = ViserMujocoScene(server, model, num_envs=1), model.geom_rgba.copy()
 
     def show(player: Player) -> None:

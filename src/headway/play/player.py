@@ -92,13 +92,11 @@ class Player:
         Whole numbers of which one is 0 or negative are kinds, such as a leg or a sign; others are
         amounts, which go from the least to the largest of training and unseen values.
         """
-        groups = [self._sets.train, *self._sets.unseen.values()]
+        physics = [row for group in self._sets.group_names for row in self._sets.group(group)]
         signed, found = getattr(getattr(self.env, "world", None), "signed", ()), {}
         for name, usual in self.spec.default_sim_params.items():
             values = {float(usual)} | ({-1.0, 1.0} if name in signed else set())
-            for group in groups:
-                given = group.get(name, ())
-                values |= {given.low, given.high} if isinstance(given, Uniform) else {*given}
+            values |= {row[name] for row in physics if name in row}
             kinds = min(values) <= 0 and all(value.is_integer() for value in values)
             if len(values) > 1:
                 ends = Uniform(min(values), max(values))
@@ -193,15 +191,16 @@ class Player:
         """
         due = time.perf_counter()
         while not self.stopped:
-            wait = IDLE_S if self.paused else due - time.perf_counter()
+            wait = IDLE_S if self.paused else max(due - time.perf_counter(), 0.0)
             try:
-                change = self.asked.get(timeout=min(wait, IDLE_S)) if wait > 0 else None
+                change = self.asked.get(timeout=min(wait, IDLE_S))
             except queue.Empty:
-                continue
-            if change is None and not self.asked.empty():  # even if every step is late
-                change = self.asked.get()
+                if wait > 0:
+                    continue
+                change = None
             if change is not None:
                 self.message = ""
+                self._ends.clear()
             try:
                 (change or self.step)()
             except HeadwayError as error:
@@ -211,13 +210,7 @@ class Player:
                 now = time.perf_counter()
                 self._ends.append(now)
                 due = max(due + 1 / (self.rate * self.speed), now)
-            else:
-                self._ends.clear()
             show()
-
-    def close(self) -> None:
-        """Free what the environment holds."""
-        self.environments.close()
 
     def _varied(self) -> dict[str, float]:
         """What `reset` may be told: of an environment of one's own the parameters of its sets."""

@@ -5,6 +5,7 @@ The file is a zip archive. `description.json` says what goes in and out; `start.
 name (Apache-2.0), without which JAX does not read them.
 """
 
+import dataclasses
 import hashlib
 import io
 import json
@@ -19,16 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from headway.config import Config
-from headway.errors import ConfigError
-from headway.models.compilation import compiler_options, prepare_jax
+from headway.api import load
+from headway.errors import ConfigError, needs
+from headway.models.compilation import compiler_options
 from headway.planning.agent import Agent, AgentState, open_loop, step
-from headway.service import needs
 from headway.task import env_spec
 from headway.training.files import check_target, named_leaves, write_bytes
-from headway.training.methods import config_to_evaluate
 from headway.training.run import Iteration, RunDir
-from headway.training.trainers import load_agent
 
 FORMAT = 1
 PLATFORMS = ("cpu", "cuda")
@@ -65,24 +63,35 @@ def export(
     """
     path = Path(path)
     check_target(path)
-    needs("flatbuffers", "export")
+    needs("export", "flatbuffers")
     import flatbuffers
 
-    prepare_jax()
-    run = RunDir(run_dir)
-    config = config_to_evaluate(run.config(), settings or {}, ("planner",))
-    robot = Robot(load_agent(run, config, iteration=iteration))
-    exported = {
-        f"{name}.bin": jax.export.export(
-            jax.jit(getattr(robot, name)), platforms=PLATFORMS, disabled_checks=[LAYOUTS]
-        )(*args)
-        for name, args in robot.arguments().items()
-    }
-    codes = {name: bytes(each.serialize()) for name, each in exported.items()}
+    controller = load(run_dir, iteration=iteration, settings=settings)
+    robot, planner = Robot(controller.agent), controller.agent.planner
+    spaces, number = robot.agent.task.spaces, jax.ShapeDtypeStruct((), jnp.int32)
+    state = jax.eval_shape(robot.start, number, number)
+    obs = jax.ShapeDtypeStruct((spaces.obs_size,), jnp.float32)
+    action = jax.eval_shape(robot.step, state, obs)[1]
+    codes = {}
+    for function, *args in (
+        (robot.start, number, number),
+        (robot.step, state, obs),
+        (robot.applied, state, action),
+    ):
+        lower = jax.export.export(jax.jit(function), platforms=PLATFORMS, disabled_checks=[LAYOUTS])
+        codes[f"{function.__name__}.bin"] = bytes(lower(*args).serialize())
+    run, kept = RunDir(run_dir), ("env", "method", "preset", "seed")
+    config, timesteps = run.config(), run.metrics()[-1]["timesteps"]
     about = {
-        **describe(run, config, robot.agent),
+        "format": FORMAT,
+        "run": {name: getattr(config, name) for name in kept} | {"timesteps": timesteps},
+        "versions": {name: version(name) for name in ("headway", "jax", "jaxlib")},
+        **dataclasses.asdict(spaces),
+        "obs_names": env_spec(config.env).obs_names,
+        "horizon": planner.horizon,
+        "control_step": "one call is one step of the training environment",
         "platforms": PLATFORMS,
-        "compiler_options": {jax.default_backend(): compiler_options(config.planner.precision)},
+        "compiler_options": {jax.default_backend(): compiler_options(planner.precision)},
         "state": [name for name, _ in named_leaves(robot.begin(0, 0))] + ["steps_left"],
         "outcomes": OUTCOMES,
         "sha256": {name: hashlib.sha256(code).hexdigest() for name, code in codes.items()},
@@ -96,23 +105,6 @@ def export(
             archive.writestr(zipfile.ZipInfo(name), member, zipfile.ZIP_DEFLATED)
     write_bytes(path, content.getvalue())
     return path
-
-
-def describe(run: RunDir, config: Config, agent: Agent) -> dict[str, Any]:
-    """What goes in and out of a run's controller, for JSON."""
-    spaces = agent.task.spaces
-    names = ("action_kind", "action_shape", "action_dtype", "action_low", "action_high")
-    return {
-        "format": FORMAT,
-        "run": {name: getattr(config, name) for name in ("env", "method", "preset", "seed")}
-        | {"timesteps": run.metrics()[-1]["timesteps"]},
-        "versions": {name: version(name) for name in ("headway", "jax", "jaxlib")},
-        "obs_size": spaces.obs_size,
-        "obs_names": env_spec(config.env).obs_names,
-        **{name: getattr(spaces, name) for name in names},
-        "horizon": agent.planner.horizon,
-        "control_step": "one call is one step of the training environment",
-    }
 
 
 class Robot:
@@ -171,14 +163,6 @@ class Robot:
         known = jnp.isfinite(own).all()
         scaled = jnp.where(known, self.agent.task.unscale_action(own), before.action[0])
         return self._pack(before._replace(action=scaled[None], acted=before.acted & known), left)
-
-    def arguments(self) -> dict[str, tuple[Any, ...]]:
-        """Shapes of the arguments of each function."""
-        spaces, number = self.agent.task.spaces, jax.ShapeDtypeStruct((), jnp.int32)
-        state = jax.eval_shape(self.start, number, number)
-        obs = jax.ShapeDtypeStruct((spaces.obs_size,), jnp.float32)
-        action = jax.eval_shape(self.step, state, obs)[1]
-        return {"start": (number, number), "step": (state, obs), "applied": (state, action)}
 
     def begin(self, seed: Any, episode: Any) -> AgentState:
         """The agent's own state at the beginning of an episode."""

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 from headway.config import differences, tolerating_as
-from headway.errors import ConfigError, HeadwayError, RunError, one_line
-from headway.service import needs
+from headway.errors import ConfigError, HeadwayError, RunError, needs, one_line
 from headway.training.files import reading, write_bytes
 from headway.training.methods import METHODS, make_config
 from headway.training.run import RunDir, format_sim_params
 
 HUB = "hf://"
 CARD = "README.md"
+TEMPLATE = Path(__file__).with_name("card.md")
 PARTS = (CARD, "*.json", "*.jsonl", "*.csv", "*/iteration-*")
 
 
@@ -90,14 +90,9 @@ def _copy(run: RunDir, files: dict[str, bytes], folder: Path, name: str) -> None
     Raises:
         RunError: The folder holds something else, or more of the run.
     """
-    if folder.exists() and not folder.is_dir():
-        raise RunError(f"{name} is a file, allowed: a folder; choose another.")
-    theirs = folder / "config.json"
-    if folder.exists() and any(path.name[0] != "." for path in folder.iterdir()):
-        with reading(theirs):
-            known = _identity(theirs.read_bytes())
+    if any(folder.glob("[!.]*")):
         later = RunDir(folder).finished_iterations > run.finished_iterations
-        if later or known != _identity(files["config.json"]):
+        if later or _identity(folder) != _identity(run.path):
             raise RunError(
                 f"{name} holds another run or a later state of it, allowed: a new folder, or an"
                 " earlier state of the same run."
@@ -106,11 +101,13 @@ def _copy(run: RunDir, files: dict[str, bytes], folder: Path, name: str) -> None
         write_bytes(folder / path, files[path])
 
 
-def _identity(content: bytes) -> Any:
-    """What of a `config.json` stays as a run becomes longer."""
-    values = json.loads(content)
-    values["config"]["collection"]["num_iterations"] = None
-    return values
+def _identity(folder: Path) -> Any:
+    """What of a run's `config.json` stays as the run becomes longer."""
+    path = folder / "config.json"
+    with reading(path):
+        values = json.loads(path.read_bytes())
+        values["config"]["collection"]["num_iterations"] = None
+        return values
 
 
 @contextlib.contextmanager
@@ -124,7 +121,7 @@ def _hub(target: str | Path, wanted: Sequence[str]) -> Iterator[tuple[Path, Call
     if not str(target).startswith(HUB):
         yield Path(target), lambda message: None
         return
-    needs("huggingface_hub", "hub")
+    needs("hub", "huggingface_hub")
     from huggingface_hub import HfApi
     from huggingface_hub.errors import RepositoryNotFoundError
 
@@ -156,58 +153,28 @@ def _hub(target: str | Path, wanted: Sequence[str]) -> Iterator[tuple[Path, Call
 
 def _card(run: RunDir, source: str) -> str:
     """The model card: what the run is, what it earned, how to load it."""
-    config, metrics, rows = run.config(), run.metrics(), run.evaluation()
+    config, rows = run.config(), run.evaluation()
     begun = json.loads((run.path / "config.json").read_bytes())
-    scores, table = [], ["| group | physics | episodes | return |", "|---|---|---|---|"]
-    tested: dict[tuple[str, str], list[float]] = {}
+    tested: dict[str, list[float]] = {}
     for row in (row for row in rows if row.iteration == rows[-1].iteration):
-        place = row.group, format_sim_params(row.sim_params)
+        place = f"{row.group} | {format_sim_params(row.sim_params)}"
         tested.setdefault(place, []).append(row.episode_return)
-    for physics, returns in tested.items():
-        mean, name = float(np.mean(returns)), ", ".join(physics)
-        table.append(
-            f"| {' | '.join(physics)} | {len(returns)} | {mean:,.1f} ± {np.std(returns):,.1f} |"
-        )
-        scores.append({"type": "mean_reward", "name": name, "value": round(mean, 3)})
-    title, method = f"{config.method} on {config.env}", config.method
-    tests = {
-        "task": {"type": "reinforcement-learning"},
-        "dataset": {"name": config.env, "type": config.env},
-        "metrics": scores,
-    }
-    header = {
-        "library_name": "headway",
-        "pipeline_tag": "reinforcement-learning",
-        "tags": ["headway", "model-based-reinforcement-learning", "robotics"],
-        "model-index": [{"name": title, "results": [tests]}],
-    }
-    usual = make_config(config.env, method=method, preset=config.preset, seed=config.seed)
+    tests = (
+        f"| {place} | {len(returns)} | {np.mean(returns):,.1f} ± {np.std(returns):,.1f} |"
+        for place, returns in tested.items()
+    )
+    usual = make_config(config.env, method=config.method, preset=config.preset, seed=config.seed)
     changed = differences(tolerating_as(usual, config), config) or ["none"]
     module, _, own = config.env.rpartition(":")
-    copy = f"runs/{config.env.replace(':', '-')}-{method}"
-    new_line = "\n"
-    return f"""---
-{new_line.join(f"{name}: {json.dumps(value)}" for name, value in header.items())}
----
-# {title}
-
-A controller trained by Headway: {METHODS[method].description}. Preset {config.preset}, seed
-{config.seed}, {metrics[-1]["timesteps"]:,} steps of the environment, on {begun["device"]}.
-{f"It needs the module `{module}` with the EnvSpec `{own}`." if module else ""}
-
-```
-headway pull {source} {copy}
-headway evaluate {copy}
-```
-
-`headway.load("{copy}").act(obs)` is its next action.
-
-## Its own tests
-
-{new_line.join(table)}
-
-## Settings
-
-Other than those of method and preset: {"; ".join(changed)}. All are in `config.json`, made with
-{", ".join(f"{name} {number}" for name, number in begun["versions"].items())}.
-"""
+    return TEMPLATE.read_text(encoding="utf-8").format(
+        config=config,
+        method=METHODS[config.method],
+        timesteps=run.metrics()[-1]["timesteps"],
+        device=begun["device"],
+        own=f"It needs the module `{module}` with the EnvSpec `{own}`." if module else "",
+        source=source,
+        copy=f"runs/{config.env.replace(':', '-')}-{config.method}",
+        tests="\n".join(tests),
+        changed="; ".join(changed),
+        versions=", ".join(f"{name} {number}" for name, number in begun["versions"].items()),
+    )
