@@ -201,13 +201,7 @@ def _minari(data: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
     space = found.observation_space
     for episode in found.iterate_episodes():
         rows = iterate(batch_space(space, len(episode.rewards) + 1), episode.observations)
-        table = {
-            "obs": [flatten(space, row) for row in rows],
-            "action": episode.actions,
-            "reward": episode.rewards,
-            "terminated": episode.terminations,
-            "truncated": episode.truncations,
-        }
+        table = {**vars(episode), "obs": [flatten(space, row) for row in rows]}
         physics = episode.infos.get("sim_params", {})
         table |= {PHYSICS + name: values for name, values in physics.items()}
         yield f"{data}, episode {episode.id}", table
@@ -301,9 +295,8 @@ def _read(
     action = np.append(action[: rows - 1], low[None], axis=0)
     known = [PHYSICS + name for name in sim_param_sets(config).names]
     columns = {name: table.column(name, rows) for name in table.arrays if name.startswith(PHYSICS)}
-    for name in columns:
-        if name not in known:
-            raise unknown_name(f"simulator parameter in {table.where},", name, known)
+    for name in {*columns} - {*known}:
+        raise unknown_name(f"simulator parameter in {table.where},", name, known)
     period = np.diff(table.column("time", rows, np.arange(rows)), append=np.nan)
     other = period <= 0  # the next row is of another recording, as after the last one
     for values in (table.column("episode", rows), *columns.values()):
@@ -329,13 +322,11 @@ def _read(
             " the bounds."
         )
     number = np.cumsum(np.append(False, (other | ends)[:-1]))
+    starts = np.searchsorted(number, np.arange(1 + number[-2]))
+    finite = {name: values for name, values in columns.items() if np.isfinite(values).all()}
     physics = [
-        {
-            name.removeprefix(PHYSICS): float(values[np.searchsorted(number, one)])
-            for name, values in columns.items()
-            if np.isfinite(values).all()
-        }
-        for one in range(1 + number[-2])
+        {name.removeprefix(PHYSICS): float(values[start]) for name, values in finite.items()}
+        for start in starts
     ]
     action = scaled_action(task, taken.astype(np.float64))
     reward = table.column("reward", rows, np.nan)
@@ -398,8 +389,8 @@ def export_data(run_dir: str | Path, out: str | Path) -> int:
     buffers = []
     for episode in episodes:
         last = np.arange(len(episode)) == len(episode) - 1
-        physics = {name: value for name, value in episode.sim_params.items() if name != RECORDING}
-        told = {name: np.full(len(episode) + 1, value) for name, value in physics.items()}
+        told = {name: np.full(len(episode) + 1, one) for name, one in episode.sim_params.items()}
+        told.pop(RECORDING, None)
         fields: dict[str, Any] = {
             "observations": episode.obs,
             "actions": env_action(task, episode.action),

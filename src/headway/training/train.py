@@ -18,7 +18,7 @@ from headway.config import Config, override
 from headway.data import Trajectory
 from headway.errors import DivergenceError, RunError
 from headway.models.fitting import EpochStats
-from headway.task import BUILT_IN
+from headway.task import BUILT_IN, episode_length
 from headway.training.check import compared, refuse_faults
 from headway.training.collect import (
     Batches,
@@ -213,9 +213,7 @@ class _Training:
         """The groups that are tested after this iteration; often none."""
         evaluation, number = self.config.evaluation, self.iteration + 1
         last = number == self.config.collection.num_iterations
-        if self.environments is None:
-            return []
-        if not last and number % evaluation.every:
+        if self.environments is None or (not last and number % evaluation.every):
             return []
         train, *unseen = self.environments.sim_params.group_names
         with_train = last or evaluation.training_group == "always"
@@ -342,12 +340,8 @@ class _Training:
             "transitions": sum(map(len, self.data)),
         }
         batches, steps = self.trainer.num_batches(self.data), measured["transitions"]
-        environments = self.environments
-        if (
-            environments
-            and batches < FEW_BATCHES
-            and 2 * steps < len(self.data) * environments.episode_length
-        ):
+        full = len(self.data) * episode_length(self.config)
+        if not self.log and batches < FEW_BATCHES and 2 * steps < full:
             warnings.warn(
                 f"{self.config.env}, iteration {iteration}: {steps} transitions make {batches}"
                 f" batches (fitting.batch_size {self.config.fitting.batch_size}), too few to learn"
