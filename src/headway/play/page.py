@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import math
 import os
 import socket
@@ -14,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
 
 from headway.config import OPTIMIZERS
 from headway.errors import BadEnvironmentError, ConfigError, needs
@@ -32,8 +32,6 @@ FRAME_S, PLOT_S = 1 / 30, 1 / 5
 """Least time between two pictures of the scene, and of the plots."""
 PUSHES = {"push −": -2.0, "push +": 2.0}
 """Changes of a velocity (m/s or rad/s)."""
-COLORS = np.array([[*bytes.fromhex(f"{color[1:]}ff")] for color in HEADS], np.uint8)
-"""Those of heads, opaque."""
 
 Show = Callable[[Player], None]
 
@@ -109,8 +107,7 @@ class Page:
             clock.on_click(lambda _: player.ask(acts[clock.value]))
             speed = gui.add_slider("speed", 0.25, 4.0, 0.25, player.speed)
             speed.on_update(lambda _: player.ask(partial(setattr, player, "speed", speed.value)))
-        nothing = np.zeros((1, 1, 4), np.uint8)
-        self._strip = gui.add_image(nothing, label="head that each network plans with")
+        self._strip = gui.add_html(self._heads())
         known = player.spec.obs_names
         names = [*known, *(f"obs[{i}]" for i in range(len(known), len(player.obs)))]
         self._entry = gui.add_dropdown("observation", names[: len(player.obs)])
@@ -178,8 +175,7 @@ class Page:
         self._status.content = self._words()
         if not moments:
             return
-        if moments[-1].heads is not None:
-            self._strip.image = self._heads()
+        self._strip.content = self._heads()
         entry, step = self._entry.options.index(self._entry.value), 1 / player.rate
         past = step * np.arange(1 - len(moments), 1)
         real = np.array([moment.obs[entry] for moment in moments])
@@ -202,17 +198,28 @@ class Page:
         words = "**paused**" if player.paused else words
         return f"{words} · reward {newest.reward:.2f}\n\n{player.message}"
 
-    def _heads(self) -> UInt8[np.ndarray, "height width 4"]:
-        """A row per network, coloured by its chosen head; dark where physics changed."""
-        moments = list(self.player.moments)
-        heads = np.array([moment.heads for moment in moments]).T
-        image = np.zeros((len(heads), REMEMBERED, 4), np.uint8)
-        recent = image[:, REMEMBERED - len(moments) :]
-        recent[:] = COLORS[heads % len(COLORS)]
-        recent[:, [moment.changed for moment in moments]] = (*INK, 255)
-        image = image.repeat(8, 0).repeat(4, 1)
-        image[7::8] = 0  # between two networks
-        return image
+    def _heads(self) -> str:
+        """A strip per network, coloured by its chosen head; a line where physics changed."""
+        moments, parts = list(self.player.moments), []
+        first = REMEMBERED - len(moments)
+        members = list(zip(*(m.heads for m in moments if m.heads is not None), strict=True))
+        for row, heads in enumerate(members):
+            at = first
+            for head, same in itertools.groupby(heads):
+                long, color = len(list(same)), HEADS[int(head) % len(HEADS)]
+                parts.append(f'<rect x="{at}" y="{10 * row}" width="{long}" fill="{color}"/>')
+                at += long
+        for at, moment in enumerate(moments, first):
+            if moment.changed:
+                parts.append(f'<rect x="{at}" width="1" style="height: 100%"/>')
+        rows = len(members)
+        return (
+            "<style>.heads rect { height: 7px }</style>"
+            '<div style="padding: 0 0.6em"><small>head that each network plans with</small>'
+            f'<svg class="heads" viewBox="0 0 {REMEMBERED} {10 * rows}" preserveAspectRatio="none"'
+            f' shape-rendering="crispEdges" style="width: 100%; height: {16 * rows}px">'
+            f"{''.join(parts)}</svg></div>"
+        )
 
 
 def _scene(server: Any, player: Player) -> Show:
