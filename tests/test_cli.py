@@ -189,7 +189,7 @@ def test_train_prints_a_table_the_figures_and_what_to_do_next(capsys, calls, tmp
     words = "train pendulum --preset quick --seed 3 --resume-from-last-good --quiet"
     code, out, err = run(capsys, *words.split())
     assert (code, err) == (0, "")
-    for text in ("training", "length 0.5 m", "-1,091.0 ± 50.0", "1.00", str(tmp_path / "a.png")):
+    for text in ("training", "length 0.5", "-1,091.0 ± 50.0", "1.00", str(tmp_path / "a.png")):
         assert text in out
     assert f"headway evaluate {tmp_path / 'run'}" in out
     assert f"headway {words}" in out

@@ -147,8 +147,8 @@ def test_physics_are_written_for_readers():
     assert tables.distinct(physics)[0]["length"] == 0.5
     assert tables.varying(physics) == ["length"]
     assert tables.varying(physics[:1]) == ["length", "mass"]
-    assert tables.axis_label(["length", "mass_scale"]) == "length (m), mass scale"
-    assert tables.full_label(physics[0], ["length"]) == "length 1.5 m"
+    assert tables.axis_label(["length", "mass_scale"]) == "length, mass scale"
+    assert tables.full_label(physics[0], ["length"]) == "length 1.5"
 
 
 def test_a_missing_extra_is_one_clear_line():

@@ -29,7 +29,6 @@ from headway.training.run import EpisodeRow, RunDir, parse_sim_params
 REFERENCES = ("random", "true-dynamics")
 TRAIN, COLLECTED = "train", "collected"
 PHASES = ("collect", "fit", "evaluate")
-UNITS = {"length": "m", "mass": "kg"}
 SERIES = ["env", "label", "seed", "run"]  # the keys of a run in every table
 
 _FILES: dict[str, tuple[str, str, dict[str, type]]] = {  # by table: file, loss without it, columns
@@ -461,15 +460,11 @@ def value_label(sim_params: Physics, names: Sequence[str]) -> str:
 
 
 def axis_label(names: Sequence[str]) -> str:
-    """Write the names of some parameters with their units, for example `length (m)`."""
-    units = [f" ({UNITS[name]})" if name in UNITS else "" for name in names]
-    return ", ".join(n.replace("_", " ") + unit for n, unit in zip(names, units, strict=True))
+    """Write the names of some parameters, for example `length, mass scale`."""
+    return ", ".join(name.replace("_", " ") for name in names)
 
 
 def full_label(sim_params: Physics, names: Sequence[str]) -> str:
-    """Write names, values and units, for example `length 0.5 m`."""
-    return ", ".join(
-        f"{name.replace('_', ' ')} {sim_params[name]:g} {UNITS.get(name, '')}".rstrip()
-        for name in names
-        if name in sim_params
-    )
+    """Write names and values, for example `length 0.5`."""
+    known = [name for name in names if name in sim_params]
+    return ", ".join(f"{name.replace('_', ' ')} {sim_params[name]:g}" for name in known)
