@@ -173,6 +173,21 @@ def test_the_clock_steps_pauses_and_does_what_is_asked(tmp_path, monkeypatch):
     assert 0 < player.pace < 1.5
 
 
+def test_nothing_moves_while_nobody_looks(tmp_path, monkeypatch):
+    player, looks = Player(lamp(tmp_path, monkeypatch)), iter([False] * 5 + [True] * 9)
+
+    def show():
+        player.stopped = len(player.moments) == 3
+
+    def watched():
+        look = next(looks)
+        assert look or len(player.moments) == 1
+        return look
+
+    player.run(show, watched)
+    assert len(player.moments) == 3
+
+
 @pytest.mark.parametrize("cls", [Lamp, DimmableLamp])
 def test_an_own_environment_changes_at_once_or_begins_again(tmp_path, monkeypatch, cls):
     player = Player(lamp(tmp_path, monkeypatch, cls))
@@ -225,7 +240,7 @@ def served(tmp_path, monkeypatch, request):
     shown = Page(player, "127.0.0.1", 8300)
     # Reflections take half a minute where there is no GPU.
     shown.server.scene.configure_environment_map(None)
-    thread = threading.Thread(target=player.run, args=[shown.show])
+    thread = threading.Thread(target=player.run, args=[shown.show, shown.server.get_clients])
     thread.start()
     yield SimpleNamespace(player=player, address=shown.address)
     player.stopped = True

@@ -64,7 +64,7 @@ def play(run_dir: str | Path | None = None, *, host: str = "127.0.0.1", port: in
         print(f"Open {page.address} (Ctrl-C ends)", file=sys.stderr, flush=True)
         if sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}:
             webbrowser.open(page.address)
-        player.run(page.show)
+        player.run(page.show, page.server.get_clients)
     except KeyboardInterrupt:
         pass
     finally:

@@ -183,15 +183,17 @@ class Player:
         """Have something done between two steps; any thread may ask."""
         self.asked.put(change)
 
-    def run(self, show: Callable[[], None]) -> None:
+    def run(self, show: Callable[[], None], watched: Callable[[], Any] = lambda: True) -> None:
         """Step in real time until `stopped`; steps that are late are not made up for.
 
         Args:
             show: Called after every step and every change.
+            watched: Asked whether anybody looks; after the first step nothing moves if not.
         """
         due = time.perf_counter()
         while not self.stopped:
-            wait = IDLE_S if self.paused else max(due - time.perf_counter(), 0.0)
+            idle = self.paused or (self.moments and not watched())
+            wait = IDLE_S if idle else max(due - time.perf_counter(), 0.0)
             try:
                 change = self.asked.get(timeout=min(wait, IDLE_S))
             except queue.Empty:
