@@ -87,3 +87,17 @@ def two_iterations(reference) -> Path:
 def root(two_iterations, tmp_path) -> Path:
     """A copy of that run, to be changed."""
     return Path(shutil.copytree(two_iterations, tmp_path / "run"))
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Headless Chromium; tests are skipped where it or Playwright is missing."""
+    api = pytest.importorskip("playwright.sync_api", reason="no Playwright: pip install playwright")
+    names = "chromium-headless-shell", "chromium", "google-chrome"
+    chromium = next(filter(None, map(shutil.which, names)), None)
+    if chromium is None:
+        pytest.skip("no Chromium here: apt-get install chromium-headless-shell")
+    with api.sync_playwright() as playwright:
+        launched = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        yield launched
+        launched.close()

@@ -1,7 +1,6 @@
 """The live player: its loop without a page, the run that ships, and the page in a browser."""
 
 import itertools
-import shutil
 import threading
 from types import SimpleNamespace
 
@@ -19,10 +18,6 @@ from headway.sim_params import SimParamSets, Uniform
 from headway.task import EnvSpec
 from headway.training.run import RunDir
 from toys import PointTask
-
-CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "google-chrome"))), None
-)
 
 
 class Lamp(gymnasium.Env):
@@ -247,17 +242,6 @@ def served(tmp_path, monkeypatch, request):
     thread.join()
     shown.server.stop()
     player.environments.close()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    api = pytest.importorskip("playwright.sync_api", reason="no Playwright: pip install playwright")
-    if CHROMIUM is None:
-        pytest.skip("no Chromium here: apt-get install chromium-headless-shell")
-    with api.sync_playwright() as playwright:
-        launched = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield launched
-        launched.close()
 
 
 @pytest.mark.parametrize(

@@ -19,9 +19,6 @@ CHAPTERS = [
     "results", "learning-curves", "physics", "improvement", "head-shares", "prediction-error",
     "settings", "times", "runs", "numbers",
 ]  # fmt: skip
-CHROMIUM = next(
-    filter(None, map(shutil.which, ("chromium-headless-shell", "chromium", "google-chrome"))), None
-)
 HOSTILE = '<script>alert("1")</script>&amp;$x_{2}$'
 
 
@@ -119,17 +116,6 @@ def test_names_with_html_are_only_text(tmp_path):
     assert "<script" not in page
     assert "<b>" not in page
     assert HOSTILE in html.unescape(page)
-
-
-@pytest.fixture(scope="module")
-def browser():
-    api = pytest.importorskip("playwright.sync_api", reason="no Playwright: pip install playwright")
-    if CHROMIUM is None:
-        pytest.skip("no Chromium here: apt-get install chromium-headless-shell")
-    with api.sync_playwright() as playwright:
-        launched = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield launched
-        launched.close()
 
 
 @pytest.mark.parametrize(("scheme", "width"), [("light", 1280), ("dark", 360)])

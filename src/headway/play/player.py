@@ -193,6 +193,8 @@ class Player:
         due = time.perf_counter()
         while not self.stopped:
             idle = self.paused or (self.moments and not watched())
+            if idle:
+                self._ends.clear()  # a rest is no delay
             wait = IDLE_S if idle else max(due - time.perf_counter(), 0.0)
             try:
                 change = self.asked.get(timeout=min(wait, IDLE_S))
