@@ -50,6 +50,9 @@ USUAL = {  # settings that --help shows; --help-all shows all of them
     "evaluation": ("num_episodes", "every"),
 }
 
+COMMANDS: dict[str, type["Command"]] = {}
+"""Every command by its name: the class `PlotDynamics` is `plot-dynamics`."""
+
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 EnvName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
@@ -81,14 +84,20 @@ class Names:
         return {} if self.optimizer is None else {"planner.optimizer.name": self.optimizer}
 
 
+@typing.dataclass_transform(frozen_default=True)
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """Options of every command."""
+    """Options of every command; a subclass is a frozen dataclass, and named on the command line."""
 
     json: Flag = False
     """Print one JSON line of results on stdout."""
     quiet: Flag = False
     """Show no progress."""
+
+    def __init_subclass__(cls):
+        dataclasses.dataclass(frozen=True)(cls)
+        if not cls.__name__.startswith("_"):
+            COMMANDS[re.sub(r"\B(?=[A-Z])", "-", cls.__name__).lower()] = cls
 
     def run(self, words: Sequence[str]) -> int:
         """Do it, and return the exit code; `words` are those that asked for it."""
@@ -121,17 +130,21 @@ class Command:
 
         return make_progress(self.quiet)
 
+    @property
+    def sections(self) -> dict[str, Any]:
+        """Those of a run's settings that this command has."""
+        return {name: value for name, value in vars(self).items() if name in SECTIONS}
+
     def changed(self, config: Config) -> dict[str, Any]:
         """Settings by dotted name that differ from those of a configuration."""
-        mine = {name: getattr(self, name) for name in SECTIONS if hasattr(self, name)}
-        asked = flatten({name: dataclasses.asdict(section) for name, section in mine.items()})
+        mine = {name: dataclasses.asdict(section) for name, section in self.sections.items()}
+        asked = flatten(mine)
         tag = "planner.optimizer.name"
         chosen = {} if asked[tag] == config.planner.optimizer.name else {tag: asked[tag]}
         usual = flatten(to_dict(override(config, chosen)))
         return chosen | {name: value for name, value in asked.items() if value != usual[name]}
 
 
-@dataclasses.dataclass(frozen=True)
 class Train(Command):
     """Train a controller on an environment whose physics vary; resume if it was begun before.
 
@@ -244,7 +257,6 @@ class Train(Command):
         )
 
 
-@dataclasses.dataclass(frozen=True)
 class Fit(Train):
     """Fit a model to recordings alone, and show how well and what its heads are for.
 
@@ -281,7 +293,6 @@ class Fit(Train):
         )
 
 
-@dataclasses.dataclass(frozen=True)
 class ExportData(Command):
     """Write what a run collected as a Minari data set."""
 
@@ -299,7 +310,6 @@ class ExportData(Command):
         return self.show(facts, f"{self.out}: {episodes} episodes")
 
 
-@dataclasses.dataclass(frozen=True)
 class _OfRun(Command):
     """A command about a trained run, whose settings are the defaults."""
 
@@ -307,21 +317,16 @@ class _OfRun(Command):
     """The run directory."""
     planner: PlannerConfig = PlannerConfig()
 
-    def config(self) -> Config:
-        """Read the settings of the run."""
-        from headway.training.run import RunDir
-
-        return RunDir(self.run_dir).config()
+    def settings(self) -> dict[str, Any]:
+        """Settings by dotted name that differ from those of the run."""
+        return self.changed(_config(self.run_dir))
 
     def with_defaults(self, names):
         """Take the settings of the run."""
-        config = dataclasses.replace(self, run_dir=Path(names.words[0])).config()
-        config = override(config, names.settings())
-        taken = [name for name in ("planner", "evaluation") if hasattr(self, name)]
-        return dataclasses.replace(self, **{name: getattr(config, name) for name in taken})
+        config = override(_config(names.words[0]), names.settings())
+        return dataclasses.replace(self, **{name: getattr(config, name) for name in self.sections})
 
 
-@dataclasses.dataclass(frozen=True)
 class Evaluate(_OfRun):
     """Test a trained run on training and unseen physics; nothing in its directory changes.
 
@@ -341,7 +346,7 @@ class Evaluate(_OfRun):
 
     def run(self, words):
         """Test, print returns per physics, and what planning took."""
-        settings = self.changed(self.config())
+        settings = self.settings()
         from headway.lab import tables
         from headway.training import evaluate
 
@@ -368,7 +373,6 @@ class Evaluate(_OfRun):
         return self.show(facts, table, f"Planning took {took} per step.")
 
 
-@dataclasses.dataclass(frozen=True)
 class Record(_OfRun):
     """Film an episode of a trained run, with the heads that it plans with; GIF or MP4.
 
@@ -399,7 +403,6 @@ class Record(_OfRun):
                     " 60:length=0.5."
                 )
             schedule.setdefault(int(found[1]), {}).update(_physics([found[2]], "--schedule"))
-        settings = self.changed(self.config())
         from headway.lab.record import record
         from headway.training.files import check_target
 
@@ -412,7 +415,7 @@ class Record(_OfRun):
             seed=self.seed,
             num_steps=self.steps,
             iteration=self.iteration,
-            settings=settings,
+            settings=self.settings(),
             progress=self.progress(),
         )
         facts = {"film": str(film.path), "env": film.env, "steps": film.steps}
@@ -420,7 +423,6 @@ class Record(_OfRun):
         return self.show({**facts, "return": film.episode_return}, text)
 
 
-@dataclasses.dataclass(frozen=True)
 class Play(Command):
     """Watch a trained controller live in the browser, and change its physics while it acts."""
 
@@ -444,7 +446,6 @@ class Play(Command):
         return 0
 
 
-@dataclasses.dataclass(frozen=True)
 class Diagnose(_OfRun):
     """Measure how well a trained run selects heads, and how well it knows its own error.
 
@@ -463,7 +464,6 @@ class Diagnose(_OfRun):
 
     def run(self, words):
         """Diagnose, and print tables."""
-        settings = self.changed(self.config())
         from headway.lab import diagnose as lab
 
         found = lab.diagnose(
@@ -471,13 +471,12 @@ class Diagnose(_OfRun):
             groups=self.group or None,
             num_episodes=self.episodes,
             collected=self.collected,
-            settings=settings,
+            settings=self.settings(),
             progress=self.progress(),
         )
         return self.show(lab.facts(found), *lab.tables(found))
 
 
-@dataclasses.dataclass(frozen=True)
 class Export(_OfRun):
     """Write a trained run's controller as one file that plans with JAX alone.
 
@@ -491,14 +490,12 @@ class Export(_OfRun):
 
     def run(self, words):
         """Export, and print where the file is."""
-        settings = self.changed(self.config())
         from headway.service.export import export
 
-        path = export(self.run_dir, self.output, iteration=self.iteration, settings=settings)
+        path = export(self.run_dir, self.output, iteration=self.iteration, settings=self.settings())
         return self.show({"file": str(path)}, f"{path}: {path.stat().st_size / 1e6:.2g} MB")
 
 
-@dataclasses.dataclass(frozen=True)
 class Serve(_OfRun):
     """Answer observations with actions over a WebSocket, until Ctrl-C or SIGTERM.
 
@@ -522,7 +519,6 @@ class Serve(_OfRun):
 
     def run(self, words):
         """Serve; print where once robots may connect, and who comes and goes."""
-        settings = self.changed(self.config())
         from headway.service.serve import serve
 
         def ready(url: str) -> None:
@@ -534,7 +530,7 @@ class Serve(_OfRun):
         serve(
             self.run_dir,
             token=self.token or os.environ.get("HEADWAY_TOKEN"),
-            settings=settings,
+            settings=self.settings(),
             ready=ready,
             say=self.progress().message,
             **{name: getattr(self, name) for name in names},
@@ -542,7 +538,6 @@ class Serve(_OfRun):
         return 0
 
 
-@dataclasses.dataclass(frozen=True)
 class Push(Command):
     """Copy a finished run, with a model card, to a folder or the Hugging Face Hub."""
 
@@ -561,7 +556,6 @@ class Push(Command):
         return self.show({"target": target}, f"headway pull {shlex.quote(target)} DIR")
 
 
-@dataclasses.dataclass(frozen=True)
 class Pull(Command):
     """Copy a run that was pushed to a folder or the Hugging Face Hub, and check all of it."""
 
@@ -578,7 +572,6 @@ class Pull(Command):
         return self.show({"run_dir": path}, path)
 
 
-@dataclasses.dataclass(frozen=True)
 class Report(Command):
     """Compare runs on one HTML page that needs nothing else: no network, no other file."""
 
@@ -599,7 +592,6 @@ class Report(Command):
         return self.show({"report": path}, path)
 
 
-@dataclasses.dataclass(frozen=True)
 class _Runs(Command):
     """Options of the commands that make many runs."""
 
@@ -661,7 +653,6 @@ class _Runs(Command):
         return 1 if done.failures else 0
 
 
-@dataclasses.dataclass(frozen=True)
 class Reproduce(_Runs):
     """Run what is missing of an experiment of the paper, and draw and tabulate it.
 
@@ -685,7 +676,6 @@ class Reproduce(_Runs):
         return self.compare(found, {name: values[0] for name, values in grid.items()}, words)
 
 
-@dataclasses.dataclass(frozen=True)
 class Sweep(_Runs):
     """Run methods in environments with seeds and settings, all of them with each other.
 
@@ -707,7 +697,6 @@ class Sweep(_Runs):
         return self.compare(sweep_experiment(self.name, self.methods, grid), fixed, words)
 
 
-@dataclasses.dataclass(frozen=True)
 class List(Command):
     """List what can be named on the command line."""
 
@@ -777,7 +766,6 @@ class List(Command):
         return self.show({self.what: entries}, table)
 
 
-@dataclasses.dataclass(frozen=True)
 class Check(Command):
     """Compare an environment with its Task, within seconds; exit code 1 if there is a fault."""
 
@@ -797,7 +785,6 @@ class Check(Command):
         return int(any(row.status == "fault" for row in found))
 
 
-@dataclasses.dataclass(frozen=True)
 class PlotDynamics(Command):
     """Draw the next states of the same states and actions under each training physics."""
 
@@ -827,27 +814,6 @@ class PlotDynamics(Command):
         return self.show({"env": name, "figure": str(path)}, str(path))
 
 
-COMMANDS: dict[str, type[Command]] = {
-    "train": Train,
-    "fit": Fit,
-    "export-data": ExportData,
-    "evaluate": Evaluate,
-    "record": Record,
-    "play": Play,
-    "diagnose": Diagnose,
-    "export": Export,
-    "serve": Serve,
-    "push": Push,
-    "pull": Pull,
-    "report": Report,
-    "reproduce": Reproduce,
-    "sweep": Sweep,
-    "list": List,
-    "check": Check,
-    "plot-dynamics": PlotDynamics,
-}
-
-
 def parse(words: Sequence[str]) -> Command:
     """Parse a command line.
 
@@ -875,14 +841,22 @@ def parse(words: Sequence[str]) -> Command:
     named = names.task if command is Fit else names.words or names.from_run
     default = command().with_defaults(names) if named else command()
     asked = functools.partial(tyro.cli, prog=f"headway {words[0]}", config=config)
-    if {"-h", "--help"} & set(rest) and any(hasattr(default, name) for name in SECTIONS):
-        sections = {name: value for name, value in vars(default).items() if name in SECTIONS}
-        brief = {name: _brief(value, USUAL.get(name, ())) for name, value in sections.items()}
-        default = dataclasses.replace(default, **brief)
+    if {"-h", "--help"} & set(rest) and default.sections:
+        default = dataclasses.replace(
+            default,
+            **{name: _brief(one, USUAL.get(name, ())) for name, one in default.sections.items()},
+        )
         told = f"{inspect.cleandoc(command.__doc__ or '')}\n--help-all shows all settings."
         return asked(command, default=default, args=["--help"], description=told)
     rest = ["--help" if word == "--help-all" else word for word in rest]
     return asked(command, default=default, args=rest)
+
+
+def _config(run_dir: str | Path) -> Config:
+    """Read the settings of a run."""
+    from headway.training.run import RunDir
+
+    return RunDir(run_dir).config()
 
 
 def _brief(section: Any, shown: Sequence[str]) -> Any:

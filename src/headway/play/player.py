@@ -62,12 +62,11 @@ class Player:
         self.config = RunDir(run_dir).config()
         self.spec = env_spec(self.config.env)
         self.controller = load(run_dir)
-        endless = {"episode_length": LARGEST, "num_episodes": 1, "env_processes": False}
-        config = override(self.config, {f"collection.{n}": v for n, v in endless.items()})
+        endless = override(self.config, {"collection.episode_length": LARGEST})
         try:
-            self.environments = Environments.make(config, film=True)
+            self.environments = Environments.make(endless, single=True, film=True)
         except BadEnvironmentError:  # one that draws no frames
-            self.environments = Environments.make(config)
+            self.environments = Environments.make(endless, single=True)
         self.env: Any = self.environments.vector
         self._sets = self.environments.sim_params
         self.rate = float(self.env.metadata["render_fps"] or 20)

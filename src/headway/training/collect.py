@@ -19,14 +19,7 @@ from headway.errors import BadEnvironmentError, HeadwayError, one_line, shown
 from headway.planning.agent import Agent
 from headway.sim_params import SimParamSets
 from headway.spaces import Spaces
-from headway.task import (
-    Task,
-    env_action,
-    env_options,
-    episode_length,
-    sim_param_sets,
-    task_of,
-)
+from headway.task import Task, env_action, env_options, episode_length, sim_param_sets, task_of
 from headway.training.files import Arrays
 from headway.training.run import Partial, trajectories_from, trajectory_arrays
 
@@ -54,8 +47,10 @@ class Environments:
     episode_length: int
 
     @classmethod
-    def make(cls, config: Config, *, film: bool = False) -> "Environments":
-        """Make as many as a configuration collects episodes, or one that can be filmed.
+    def make(cls, config: Config, *, single: bool = False, film: bool = False) -> "Environments":
+        """Make as many as a configuration collects episodes, or a single one in this process.
+
+        One for a film can be drawn; it runs in a process of its own where the others do.
 
         Raises:
             BadEnvironmentError: It cannot be made, its spaces do not fit its Task or its run, or
@@ -64,15 +59,15 @@ class Environments:
         from headway import envs  # a controller is loaded without a simulator
 
         collection, options = config.collection, env_options(config)
-        sim_params = sim_param_sets(config)
+        sim_params, apart = sim_param_sets(config), collection.env_processes and not single
         with raising(config.env, "creation" + film * " with render_mode, to be filmed"):
             vector = envs.make_vec(
                 config.env,
-                1 if film else collection.num_episodes,
+                1 if single or film else collection.num_episodes,
                 sim_params=sim_params,
                 options=options,
                 episode_length=episode_length(config),
-                step_timeout_s=collection.step_timeout_s if collection.env_processes else None,
+                step_timeout_s=collection.step_timeout_s if apart else None,
                 render_mode="rgb_array" if film else None,
             )
         try:

@@ -6,7 +6,6 @@ Nothing is ever written to stdout, which belongs to results.
 import sys
 import time
 from collections.abc import Mapping
-from types import TracebackType
 from typing import Any, Self
 
 SILENCE = 30.0  # seconds after which plain lines give a sign of life
@@ -18,12 +17,7 @@ class Progress:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Stop the display."""
 
     def phase(self, name: str, total: int) -> None:
@@ -60,7 +54,7 @@ class Lines(Progress):
         self._name, self._total, self._done = "", 1, 0
         self._begun = self._printed = time.monotonic()
 
-    def __exit__(self, kind, error, trace) -> None:
+    def __exit__(self, kind, *_) -> None:
         """Say how the last phase went, unless it was cut short."""
         if kind is None:
             self._end_phase()
@@ -118,7 +112,7 @@ class Bar(Progress):
         self._bar.start()
         return self
 
-    def __exit__(self, kind, error, trace) -> None:
+    def __exit__(self, kind, *_) -> None:
         """Remove the bar; what was said stays."""
         self._bar.stop()
 

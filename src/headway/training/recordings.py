@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from headway.config import Config, override
+from headway.config import Config
 from headway.data import Trajectory
-from headway.errors import ConfigError, HeadwayError, one_line, unknown_name
+from headway.errors import ConfigError, HeadwayError, needs, one_line, unknown_name
 from headway.task import Task, env_action, episode_length, scaled_action, sim_param_sets, task_of
 from headway.training.check import compared, method_findings
 from headway.training.collect import Environments
@@ -38,6 +38,7 @@ ALIASES = {
     "episode": "episodes episode_id episode_index trajectory trajectory_id",
 }
 """Names of what a recording may hold, and what others call it."""
+MINARI = ("minari", "h5py")  # h5py it looks for only as it reads or writes
 ROUNDING = 1e-3  # share of an action's range by which a recorded one may be beyond it
 JITTER = 0.5  # share of the usual period by which another one may be shorter or longer
 
@@ -125,7 +126,7 @@ def read_log(data: Data, config: Config, held_out: float, names: Mapping[str, st
 def _task(config: Config) -> Task:
     """The Task, told the spaces of its environment, or those that it states where none is made."""
     try:
-        with closing(_environment(config)) as environment:
+        with closing(Environments.make(config, single=True)) as environment:
             return environment.task
     except HeadwayError:
         with suppress(AttributeError):
@@ -133,20 +134,11 @@ def _task(config: Config) -> Task:
         raise
 
 
-def _environment(config: Config) -> Environments:
-    one = {"collection.num_episodes": 1, "collection.env_processes": False}
-    return Environments.make(override(config, one))
-
-
 @contextmanager
 def _reading(where: Any) -> Iterator[None]:
     """Turn whatever a reader raises into one line."""
     try:
         yield
-    except ImportError as error:
-        raise ConfigError(
-            f"{where} needs {error.name}, which is missing; pip install 'headway[data]'."
-        ) from None
     except Exception as error:  # whatever the file of another program does to its reader
         raise ConfigError(f"{where} cannot be read: {one_line(error, 200)}.") from None
 
@@ -158,6 +150,7 @@ def _tables(data: Data) -> Iterator[tuple[str, Mapping[str, Any]]]:
         return
     path = Path(data)
     if str(data).startswith("minari:") or (path / "data" / "metadata.json").exists():
+        needs("data", *MINARI)
         with _reading(data):
             yield from _minari(str(data))
         return
@@ -167,6 +160,8 @@ def _tables(data: Data) -> Iterator[tuple[str, Mapping[str, Any]]]:
             f"{data} holds no recordings, allowed: an .npz or .parquet file, a folder of them, a"
             " Minari data set, minari:ID; check the path."
         )
+    if any(file.suffix == ".parquet" for file in files):
+        needs("data", "pyarrow")
     for file in files:
         with _reading(file):
             # NumPy unpickles nothing unless it is told to.
@@ -190,7 +185,6 @@ def _parquet(file: Path) -> Mapping[str, Any]:
 
 
 def _minari(data: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    import h5py  # noqa: F401 (Minari looks for it only as it reads)
     import minari
     from gymnasium.spaces import flatten
     from gymnasium.vector.utils import batch_space, iterate
@@ -372,11 +366,11 @@ def export_data(run_dir: str | Path, out: str | Path) -> int:
         RunError: There is no run, or the folder cannot be written.
         ConfigError: Minari is missing, the run has no data, or `out` has no version or exists.
     """
-    with _reading("export-data"):
-        import h5py  # noqa: F401 (Minari asks for it as it writes)
-        import minari
-        from minari.data_collector import EpisodeBuffer
-        from minari.dataset.minari_storage import MinariStorage
+    needs("data", *MINARI)
+    import minari
+    from minari.data_collector import EpisodeBuffer
+    from minari.dataset.minari_storage import MinariStorage
+
     run, out = RunDir(run_dir), Path(out).absolute()  # Minari misreads relative paths
     config, episodes = run.config(), run.load_data()
     if not episodes or out.exists() or not re.fullmatch(r"[-\w]+-v\d+", out.name):
@@ -384,7 +378,7 @@ def export_data(run_dir: str | Path, out: str | Path) -> int:
             f"{run_dir} has {len(episodes)} episodes and is exported to {out}, allowed: some, and a"
             " folder that is not there yet, with a version at its end, as pendulum-v0."
         )
-    with closing(_environment(config)) as environment:
+    with closing(Environments.make(config, single=True)) as environment:
         task, vector = environment.task, environment.vector
     buffers = []
     for episode in episodes:
