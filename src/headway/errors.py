@@ -2,7 +2,7 @@
 
 import difflib
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from importlib.util import find_spec
 from typing import Any
 
@@ -18,7 +18,7 @@ class ConfigError(HeadwayError, ValueError):
     """A setting is unknown, of the wrong type, or out of range."""
 
 
-class UnknownNameError(HeadwayError, KeyError):
+class UnknownNameError(ConfigError, KeyError):
     """A name (environment, method, preset, group, ...) is not in its table."""
 
     def __str__(self) -> str:
@@ -91,6 +91,17 @@ def unknown_name(kind: str, got: str, allowed: Iterable[str]) -> UnknownNameErro
         return UnknownNameError(f"unknown {kind} {shown(got)}. There is none; leave it out.")
     hint = did_you_mean(got, names)
     return UnknownNameError(f"unknown {kind} {shown(got)}.{hint} Allowed: {', '.join(names[:99])}.")
+
+
+def check_names(kind: str, names: Iterable[str], allowed: Collection[str]) -> None:
+    """Make sure that names are in their table; arguments as `unknown_name`.
+
+    Raises:
+        UnknownNameError: One is not.
+    """
+    for name in names:
+        if name not in allowed:
+            raise unknown_name(kind, str(name), allowed)
 
 
 def needs(extra: str, *packages: str) -> None:

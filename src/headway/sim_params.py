@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from headway.errors import ConfigError, shown, unknown_name
+from headway.errors import ConfigError, check_names, shown
 
 MAX_COMBINATIONS = 100_000
 """Physics that one group may stand for."""
@@ -160,8 +160,7 @@ class SimParamSets:
         return [{key: float(column[i]) for key, column in columns.items()} for i in range(count)]
 
     def _values(self, name: str) -> Values:
-        if name not in self.group_names:
-            raise unknown_name("group", name, self.group_names)
+        check_names("group", [name], self.group_names)
         return self.train if name == "train" else self.unseen[name]
 
     @classmethod

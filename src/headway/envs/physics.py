@@ -91,7 +91,7 @@ class MujocoPhysics(gymnasium.Wrapper):
         for name, value in values.items():
             if name not in self._known:
                 parts = [one for one in self._known if not re.search(r":\d+\.", one)]
-                raise ConfigError(str(unknown_name("sim_param", name, parts)))
+                raise unknown_name("sim_param", name, parts)
             locks = name.endswith("locked")
             if not (value in (0, 1) if locks else 0 <= value < np.inf or name == "gravity"):
                 allowed = "0 or 1" if locks else "a factor of at least 0"
@@ -122,10 +122,8 @@ class MujocoPhysics(gymnasium.Wrapper):
         if inert or (new.dof_armature != self._nominal.dof_armature).any():
             mujoco.mj_setConst(new, mujoco.MjData(new))
         self._model.opt.gravity[:] = new.opt.gravity
-        for field in (
-            *_DERIVED,
-            *(field for _, _, *fields in _FIELDS.values() for field in fields),
-        ):
+        scaled = [field for _, _, *fields in _FIELDS.values() for field in fields]
+        for field in (*_DERIVED, *scaled):
             if hasattr(new, field):
                 getattr(self._model, field)[...] = getattr(new, field)
 

@@ -29,9 +29,9 @@ from headway.errors import (
     BrokenEpisodeError,
     ConfigError,
     HeadwayError,
+    check_names,
     one_line,
     shown,
-    unknown_name,
 )
 from headway.sim_params import SimParamSets
 from headway.spaces import Spaces
@@ -98,9 +98,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             ConfigError: A seed, option, parameter or value is not allowed.
         """
         options, known = options or {}, ("sim_params", "reset_mask", "schedule")
-        for name in options:
-            if name not in known:
-                raise ConfigError(str(unknown_name("reset option", str(name), known)))
+        check_names("reset option", options, known)
         each: Any = seed
         if seed is None or isinstance(seed, int | np.integer):
             each = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
@@ -191,9 +189,8 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                     f"sim_params {name} has shape {given.shape}, allowed: one value, or"
                     f" {self.num_envs}, one per environment."
                 )
-            for row, value in zip(
-                rows, np.broadcast_to(given, self.num_envs).tolist(), strict=True
-            ):
+            each = np.broadcast_to(given, self.num_envs).tolist()
+            for row, value in zip(rows, each, strict=True):
                 row[name] = value
         return [self._check_sim_params(row) for row in rows]
 
@@ -347,9 +344,8 @@ class SequentialVectorEnv(HeadwayVectorEnv):
         return answers
 
     def _check_sim_params(self, values: dict[str, Any]) -> SimParams:
-        for name in values:
-            if self._sets is not None and name not in self._sets.names:
-                raise ConfigError(str(unknown_name("sim_param", name, self._sets.names)))
+        if self._sets is not None:
+            check_names("sim_param", values, self._sets.names)
         return values
 
     def _begin(self, seeds: Mapping[int, int | None], requested: Sequence[SimParams]) -> None:

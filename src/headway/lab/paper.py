@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-from headway.errors import ConfigError, UnknownNameError, shown, unknown_name
+from headway.errors import ConfigError, UnknownNameError, check_names, shown
 from headway.training.methods import METHODS, NO_CONTEXT
 
 Settings = Mapping[str, Any]
@@ -165,8 +165,7 @@ def experiment(name: str) -> Experiment:
             "fig8 compares no methods: it shows what an action leads to under different physics;"
             " `headway plot-dynamics ENV` draws it."
         )
-    if name not in EXPERIMENTS:
-        raise unknown_name("experiment", name, EXPERIMENTS)
+    check_names("experiment", [name], EXPERIMENTS)
     return EXPERIMENTS[name]
 
 

@@ -249,17 +249,13 @@ def run_episodes(
     begun = time.perf_counter()
     wanted, vector = len(episodes), environments.vector
     filled = fill(episodes, vector.num_envs)
-    options: dict[str, Any] = {
-        "sim_params": {
-            name: np.array([episode.sim_params[name] for episode in filled])
-            for name in filled[0].sim_params
-        }
-    }
     seeds: Any = [episode.seed for episode in filled]
-    valid = _ValidityFilter(environments.name, [episode.sim_params for episode in filled])
+    physics = [episode.sim_params for episode in filled]
+    columns = {name: np.array([one[name] for one in physics]) for name in physics[0]}
+    valid = _ValidityFilter(environments.name, physics)
     running = valid.running
     with raising(environments.name, "reset"):
-        obs, info = vector.reset(seed=seeds, options=options)
+        obs, info = vector.reset(seed=seeds, options={"sim_params": columns})
     valid.heed(info, 0)
     obs = valid.finite(obs, "obs", 0, np.zeros((len(filled), environments.task.obs_size)))
     observations, actions, rewards = [obs], [], []

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from headway.config import Config, differences, override, tolerating_as
 from headway.data import Trajectory
-from headway.errors import ConfigError, unknown_name
+from headway.errors import check_names
 from headway.models.compilation import prepare_jax
 from headway.planning.agent import Agent
 from headway.planning.rollouts import plan_flop
@@ -243,9 +243,7 @@ def evaluate(
     if sim_params:
         sets, usual = sim_param_sets(config), env_spec(config.env).default_sim_params
         told = config.model.context == "sim-params"  # of them, no more and no less
-        for name in sim_params:
-            if name not in (allowed := sets.names if told else {*sets.names, *usual}):
-                raise ConfigError(str(unknown_name("sim_param", name, allowed)))
+        check_names("sim_param", sim_params, sets.names if told else {*sets.names, *usual})
         added = {name: [usual[name]] for name in sim_params if name not in sets.names}
         known = {**sets.train, **added}
         custom = known | {name: np.atleast_1d(v) for name, v in sim_params.items()}
@@ -278,7 +276,5 @@ def known_groups(wanted: Sequence[str] | None, known: Sequence[str]) -> list[str
     Raises:
         UnknownNameError: No such group.
     """
-    for group in wanted or ():
-        if group not in known:
-            raise unknown_name("group", group, known)
+    check_names("group", wanted or (), known)
     return list(dict.fromkeys(wanted or known))

@@ -17,7 +17,7 @@ import numpy as np
 
 from headway.config import Config
 from headway.data import Trajectory
-from headway.errors import ConfigError, HeadwayError, needs, one_line, unknown_name
+from headway.errors import ConfigError, HeadwayError, check_names, needs, one_line
 from headway.task import Task, env_action, episode_length, scaled_action, sim_param_sets, task_of
 from headway.training.check import compared, method_findings
 from headway.training.collect import Environments
@@ -70,9 +70,7 @@ def read_log(data: Data, config: Config, held_out: float, names: Mapping[str, st
             f"held_out is {held_out} and the method {config.method}, allowed: a share from 0 to"
             " below 1, and a method that learns."
         )
-    for name in names:
-        if name not in ALIASES:
-            raise unknown_name("name of what a recording holds", name, ALIASES)
+    check_names("name of what a recording holds", names, ALIASES)
     task = _task(config)
     for found in method_findings(task):
         if found.status == "fault":
@@ -289,8 +287,7 @@ def _read(
     action = np.append(action[: rows - 1], low[None], axis=0)
     known = [PHYSICS + name for name in sim_param_sets(config).names]
     columns = {name: table.column(name, rows) for name in table.arrays if name.startswith(PHYSICS)}
-    for name in {*columns} - {*known}:
-        raise unknown_name(f"simulator parameter in {table.where},", name, known)
+    check_names(f"simulator parameter in {table.where},", columns, known)
     period = np.diff(table.column("time", rows, np.arange(rows)), append=np.nan)
     other = period <= 0  # the next row is of another recording, as after the last one
     for values in (table.column("episode", rows), *columns.values()):

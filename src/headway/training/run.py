@@ -27,7 +27,7 @@ import json
 import platform
 import re
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -69,7 +69,7 @@ TABLES = {
     "assignments.csv": ("iteration", "member", "head", "sim_params", "share"),
     "prediction_error.csv": ("iteration", "group", "step", "error"),
 }  # fmt: skip
-_TYPES = {
+_TYPES: dict[str, Callable[[str], Any]] = {
     **dict.fromkeys(("seed", "iteration", "episode", "length", "member", "head", "step"), int),
     **dict.fromkeys(("return", "share", "error"), float),
 }
@@ -319,12 +319,8 @@ class RunDir:
 
     def evaluation(self) -> list[EpisodeRow]:
         """Every test episode of the finished iterations."""
-        rows = self._rows("evaluation.csv")
-        with reading(self.path / "evaluation.csv"):
-            return [
-                EpisodeRow(*{**row, "sim_params": parse_sim_params(row["sim_params"])}.values())
-                for row in rows
-            ]
+        rows = self._rows("evaluation.csv", sim_params=parse_sim_params)
+        return [EpisodeRow(*row.values()) for row in rows]
 
     def assignments(self) -> list[dict[str, Any]]:
         """Share of segments that each head owns, per iteration, member and physics."""
@@ -377,9 +373,8 @@ class RunDir:
         if name in self._checksums(self.last_iteration):
             self._read([name])
             arrays, facts = load_arrays(self.path / name)
-            for group, episode in zip(
-                facts["groups"], trajectories_from(arrays, facts), strict=True
-            ):
+            episodes = trajectories_from(arrays, facts)
+            for group, episode in zip(facts["groups"], episodes, strict=True):
                 found.setdefault(group, []).append(episode)
         return found
 
@@ -544,23 +539,22 @@ class RunDir:
             return {name: _checked(self.path / name, known[name]) for name in names or known}
         except RunError as error:
             good = self.last_good()
-            advice = (
-                "No earlier iteration is intact; restore the file, or start anew in another"
-                " directory."
-                if good is None
-                else f"The last good iteration is {good}: the run's `headway train` command with"
-                " --resume-from-last-good goes back to it."
-            )
+            advice = f"The last good iteration is {good}: the run's `headway train` command with"
+            advice += " --resume-from-last-good goes back to it."
+            if good is None:
+                advice = (
+                    "No earlier iteration is intact; restore the file, or start elsewhere anew."
+                )
             raise RunError(f"{error} {advice}") from None
 
     def _table(self, name: str) -> bytes:
         return self._read([name])[name] if self.finished_iterations else b""
 
-    def _rows(self, name: str) -> list[dict[str, Any]]:
-        text = self._table(name).decode()
+    def _rows(self, name: str, **types: Callable[[str], Any]) -> list[dict[str, Any]]:
+        text, types = self._table(name).decode(), _TYPES | types
         with reading(self.path / name):
             return [
-                {column: _TYPES.get(column, str)(cell) for column, cell in row.items()}
+                {column: types.get(column, str)(cell) for column, cell in row.items()}
                 for row in csv.DictReader(io.StringIO(text, newline=""))
             ]
 

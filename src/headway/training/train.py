@@ -95,11 +95,8 @@ def train_run(
     with run.locked(), progress or Progress() as shown, stop_requests() as stop:
         if resume_from_last_good:
             good = run.go_back()
-            shown.message(
-                "begins anew"
-                if good is None
-                else f"goes on after iteration {good}, which is intact"
-            )
+            intact = f"goes on after iteration {good}, which is intact"
+            shown.message("begins anew" if good is None else intact)
         with nullcontext() if log else closing(Environments.make(config)) as environments:
             if environments:
                 config = dataclasses.replace(config, spaces=environments.task.spaces)

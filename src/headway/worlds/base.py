@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from headway.errors import ConfigError, unknown_name
+from headway.errors import ConfigError, check_names
 from headway.sim_params import SimParamSets
 from headway.task import EnvSpec
 
@@ -41,9 +41,7 @@ class World:
     """Seconds between two observations."""
 
     def __init__(self, sim_params: SimParamSets | None = None, **options: bool):
-        for name in options:
-            if name not in self.spec.options:
-                raise unknown_name(f"{self.spec.name} option", name, self.spec.options)
+        check_names(f"{self.spec.name} option", options, self.spec.options)
         self.task: Any = self.spec.make_task(**options)  # options are its fields
         self.sim_params = sim_params or self.spec.sim_params
         for group in self.sim_params.group_names:
@@ -57,10 +55,8 @@ class World:
             ConfigError: A name is unknown or a value not allowed.
         """
         checked = {}
+        check_names(f"{self.spec.name} sim_param", values, self.spec.default_sim_params)
         for name, value in values.items():
-            known = self.spec.default_sim_params
-            if name not in known:
-                raise ConfigError(str(unknown_name(f"{self.spec.name} sim_param", name, known)))
             number = float(value) if isinstance(value, numbers.Real) else math.nan
             choices, positive = self.choices.get(name), name not in self.signed
             least = 0.0 if positive else -math.inf
