@@ -35,11 +35,11 @@ from headway.config import (
     to_dict,
 )
 from headway.errors import ConfigError, HeadwayError, one_line
+from headway.training.stopping import Terminated
 
 MAX_SEEDS = 1000
 PIPE_WIDTH = 130
 RESUMABLE = ("train", "fit", "reproduce", "sweep")
-TERMINATED = 143  # as a shell reports SIGTERM
 
 RUN_NAMES = ("env", "method", "preset", "seed")
 SECTIONS = ("model", "fitting", "planner", "collection", "evaluation")
@@ -53,10 +53,12 @@ USUAL = {  # settings that --help shows; --help-all shows all of them
 COMMANDS: dict[str, type["Command"]] = {}
 """Every command by its name: the class `PlotDynamics` is `plot-dynamics`."""
 
+Value = typing.TypeVar("Value")
+Word = Annotated[Value, tyro.conf.Positional]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-EnvName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
-RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+EnvName = Annotated[Word[str], tyro.conf.arg(metavar="ENV")]
+RunPath = Annotated[Word[Path], tyro.conf.arg(metavar="RUN")]
 
 
 def _unless_given(text: str):
@@ -71,7 +73,7 @@ Iteration = Annotated[int | Literal["best"] | None, _unless_given("the newest")]
 class Names:
     """The words of a line that say whose settings are the defaults of all others."""
 
-    words: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    words: Word[tuple[str, ...]] = ()
     """First of all an environment or a run."""
     method: str = "tmcl"
     preset: str = "paper"
@@ -118,10 +120,7 @@ class Command:
         width = None if sys.stdout.isatty() else PIPE_WIDTH
         console = Console(width=width, highlight=False, markup=False, emoji=False)
         for table in tables:
-            if isinstance(table, str):
-                print(table)
-            else:
-                console.print(table)
+            console.print(table, soft_wrap=isinstance(table, str))
         return 0
 
     def progress(self) -> Any:
@@ -264,7 +263,7 @@ class Fit(Train):
     defaults shown are those of the environment, method and preset named before --help.
     """
 
-    data: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")] = tyro.MISSING
+    data: Annotated[Word[str], tyro.conf.arg(metavar="DATA")] = tyro.MISSING
     """An .npz or Parquet file, a folder of them, a Minari data set (its folder, or minari:ID)."""
     env: Annotated[str, tyro.conf.arg(name="task")] = tyro.MISSING
     """Short name or id of the environment whose Task they were recorded for."""
@@ -298,7 +297,7 @@ class ExportData(Command):
 
     run_dir: RunPath = tyro.MISSING
     """The run directory."""
-    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")] = tyro.MISSING
+    out: Annotated[Word[Path], tyro.conf.arg(metavar="OUT")] = tyro.MISSING
     """The folder to make, with a version at its end, as pendulum-v0."""
 
     def run(self, words):
@@ -427,8 +426,7 @@ class Play(Command):
     """Watch a trained controller live in the browser, and change its physics while it acts."""
 
     run_dir: Annotated[
-        Path | None,
-        tyro.conf.Positional,
+        Word[Path | None],
         tyro.conf.arg(metavar="[RUN]"),
         _unless_given("a pendulum that ships with Headway"),
     ] = None
@@ -483,7 +481,7 @@ class Export(_OfRun):
     The defaults shown are those of the run named before --help.
     """
 
-    output: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")] = tyro.MISSING
+    output: Annotated[Word[Path], tyro.conf.arg(metavar="FILE")] = tyro.MISSING
     """The file to write, such as controller.headway."""
     iteration: Iteration = None
     """The iteration whose model acts, from 0, or `best` by training return."""
@@ -543,7 +541,7 @@ class Push(Command):
 
     run_dir: RunPath = tyro.MISSING
     """The run directory."""
-    target: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TARGET")] = tyro.MISSING
+    target: Annotated[Word[str], tyro.conf.arg(metavar="TARGET")] = tyro.MISSING
     """A folder, or hf://user/name, which becomes a private model."""
     data: Flag = False
     """Also the episodes it was trained on; without them it cannot be trained further."""
@@ -559,9 +557,9 @@ class Push(Command):
 class Pull(Command):
     """Copy a run that was pushed to a folder or the Hugging Face Hub, and check all of it."""
 
-    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = tyro.MISSING
+    source: Annotated[Word[str], tyro.conf.arg(metavar="SOURCE")] = tyro.MISSING
     """A folder, or hf://user/name."""
-    run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")] = tyro.MISSING
+    run_dir: Annotated[Word[Path], tyro.conf.arg(metavar="DIR")] = tyro.MISSING
     """A new directory, or one with an earlier state of the same run."""
 
     def run(self, words):
@@ -575,9 +573,7 @@ class Pull(Command):
 class Report(Command):
     """Compare runs on one HTML page that needs nothing else: no network, no other file."""
 
-    runs: Annotated[
-        tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")
-    ] = tyro.MISSING
+    runs: Annotated[Word[tuple[Path, ...]], tyro.conf.arg(metavar="RUN [RUN ...]")] = tyro.MISSING
     """Run directories, or folders that hold some; any methods, environments and seeds."""
     output: Output = Path("report.html")
     """The HTML file to write."""
@@ -659,9 +655,7 @@ class Reproduce(_Runs):
     The figure compares the runs; `headway report OUT/runs` shows what is inside each of them.
     """
 
-    experiment: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERIMENT")] = (
-        tyro.MISSING
-    )
+    experiment: Annotated[Word[str], tyro.conf.arg(metavar="EXPERIMENT")] = tyro.MISSING
     """An experiment; `headway list experiments` shows them."""
 
     def run(self, words):
@@ -700,10 +694,7 @@ class Sweep(_Runs):
 class List(Command):
     """List what can be named on the command line."""
 
-    what: Annotated[
-        Literal["envs", "methods", "presets", "experiments"],
-        tyro.conf.Positional,
-    ] = tyro.MISSING
+    what: Word[Literal["envs", "methods", "presets", "experiments"]] = tyro.MISSING
     """Names to list."""
 
     def run(self, words):
@@ -910,10 +901,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"error: {where}{error.strerror or error}", file=sys.stderr)
     except KeyboardInterrupt:
         stopped, code = "interrupted", 130
-    except SystemExit as stop:
-        if stop.code != TERMINATED:
-            raise
-        stopped, code = "terminated", TERMINATED
+    except Terminated:
+        stopped, code = "terminated", 143  # as a shell reports SIGTERM
     if stopped:
         goes_on = words and words[0] in RESUMABLE
         advice = "; the same command goes on where this one stopped" if goes_on else ""

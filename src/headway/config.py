@@ -203,13 +203,8 @@ class OwnModelConfig(ModelConfig):
     """Widths of hidden layers."""
 
 
-MODELS: dict[str, type[ModelConfig]] = {
-    "multi-headed": MultiHeadedConfig,
-    "gradient-adapted": GradientAdaptedConfig,
-    "recurrent": RecurrentConfig,
-    "simulator": SimulatorConfig,
-    "none": NoModelConfig,
-}
+_KINDS = MultiHeadedConfig, GradientAdaptedConfig, RecurrentConfig, SimulatorConfig, NoModelConfig
+MODELS: dict[str, type[ModelConfig]] = {model.kind: model for model in _KINDS}
 BUILT_IN_KINDS = tuple(MODELS)
 
 
@@ -335,12 +330,8 @@ class RandomShootingConfig(OptimizerConfig):
     """cem, icem, mppi or random-shooting; another one has other settings."""
 
 
-OPTIMIZERS: dict[str, type[OptimizerConfig]] = {
-    "cem": CEMConfig,
-    "icem": ICEMConfig,
-    "mppi": MPPIConfig,
-    "random-shooting": RandomShootingConfig,
-}
+_SEARCHES = CEMConfig, ICEMConfig, MPPIConfig, RandomShootingConfig
+OPTIMIZERS: dict[str, type[OptimizerConfig]] = {search.name: search for search in _SEARCHES}
 
 
 @settings

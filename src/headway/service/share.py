@@ -44,12 +44,7 @@ def push(run_dir: str | Path, target: str | Path, *, data: bool = False) -> str:
             missing.
     """
     run = RunDir(run_dir)
-    config, finished = run.config(), run.finished_iterations
-    if finished < config.collection.num_iterations:
-        raise RunError(
-            f"{run.path} has {finished} of {config.collection.num_iterations} iterations, allowed:"
-            " a finished run; go on training it with the same `headway train` command."
-        )
+    config = run.finished_config()
     if config.planner.adaptation != "none" and not data:
         raise ConfigError(f"the heads of {run.path} learn from its data; push it with --data.")
     files = run.files(data=data)

@@ -229,6 +229,21 @@ class RunDir:
             " again, or use the version of headway that made it."
         )
 
+    def finished_config(self) -> Config:
+        """The settings of a run that has all of its iterations.
+
+        Raises:
+            RunError: As `config`, or it has not.
+        """
+        config, finished = self.config(), self.finished_iterations
+        planned = config.collection.num_iterations
+        if finished < planned:
+            raise RunError(
+                f"{self.path} has {finished} of {planned} iterations, allowed: a finished run;"
+                " finish it first with the command that began it."
+            )
+        return config
+
     def environment_changes(self) -> list[str]:
         """One line per difference of an own environment to what it was when the run was begun."""
         with reading(self.path / "config.json"):
@@ -542,9 +557,8 @@ class RunDir:
             advice = f"The last good iteration is {good}: the run's `headway train` command with"
             advice += " --resume-from-last-good goes back to it."
             if good is None:
-                advice = (
-                    "No earlier iteration is intact; restore the file, or start elsewhere anew."
-                )
+                advice = "No earlier iteration is intact; restore the file, or start anew in"
+                advice += " another directory."
             raise RunError(f"{error} {advice}") from None
 
     def _table(self, name: str) -> bytes:

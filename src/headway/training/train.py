@@ -16,7 +16,7 @@ from jaxtyping import PRNGKeyArray
 
 from headway.config import Config, override
 from headway.data import Trajectory
-from headway.errors import DivergenceError, RunError
+from headway.errors import DivergenceError
 from headway.models.fitting import EpochStats
 from headway.task import BUILT_IN, episode_length
 from headway.training.check import compared, refuse_faults
@@ -113,15 +113,8 @@ def continued(run_dir: str | Path) -> Config:
     Raises:
         RunError: There is no run, or it is not finished.
     """
-    run = RunDir(run_dir)
-    config, finished = run.config(), run.finished_iterations
-    planned = config.collection.num_iterations
-    if finished < planned:
-        raise RunError(
-            f"{run.path} has {finished} of {planned} iterations, allowed: a finished run to go on"
-            " from; finish it first with the command that began it."
-        )
-    return override(config, {"collection.num_iterations": 2 * planned})
+    config = RunDir(run_dir).finished_config()
+    return override(config, {"collection.num_iterations": 2 * config.collection.num_iterations})
 
 
 def copy_run(run_dir: Path, to: Path) -> None:
