@@ -37,12 +37,11 @@ class Progress:
         """
 
     def iteration_done(self, metrics: Mapping[str, Any]) -> None:
-        """Finish an iteration, and say what it returned.
+        """Finish an iteration.
 
         Args:
             metrics: The iteration's line of `metrics.jsonl`.
         """
-        self.message(_returns(metrics))
 
     def message(self, text: str) -> None:
         """Say something that should stay readable."""
@@ -75,7 +74,7 @@ class Lines(Progress):
     def iteration_done(self, metrics: Mapping[str, Any]) -> None:
         """Report the phase that ended and the iteration's returns."""
         self._end_phase()
-        super().iteration_done(metrics)
+        self.message(_returns(metrics))
 
     def message(self, text: str) -> None:
         """Print a line."""
@@ -125,6 +124,10 @@ class Bar(Progress):
     def advance(self, amount: int = 1, **numbers: float) -> None:
         """Count finished work."""
         self._bar.update(self._task, advance=amount, words=_words(numbers))
+
+    def iteration_done(self, metrics: Mapping[str, Any]) -> None:
+        """Print the iteration's returns, which stay."""
+        self.message(_returns(metrics))
 
     def message(self, text: str) -> None:
         """Print a line above the bar."""
