@@ -1,4 +1,4 @@
-"""Head selection and calibration of a trained run, as tables and as plain values."""
+"""What a trained run predicts: head selection and calibration, and one episode over time."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
+from jaxtyping import Float, Int
 from rich.console import Group
 from rich.jupyter import JupyterMixin
 from rich.table import Table
@@ -15,14 +17,18 @@ from headway.data import Trajectory
 from headway.errors import ConfigError
 from headway.lab.tables import COLLECTED, distinct, full_label, group_label, new_table, varying
 from headway.models.multi_headed import MultiHeadModel
-from headway.task import sim_param_sets
+from headway.task import env_spec, sim_param_sets
 from headway.training import selection
+from headway.training.diagnostics import predict_along
 from headway.training.evaluate import evaluate, known_groups
 from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
 from headway.training.recordings import HELD_OUT
 from headway.training.run import RunDir
 from headway.training.trainers import load_agent
+
+AHEAD = 5  # steps from one prediction of an episode to its moment
+LONGEST, MOST = 200, 6  # steps and observed numbers that are legible
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,6 +132,66 @@ def diagnose(
         for i, (group, found) in enumerate(trajectories.items())
     }
     return Diagnosis(run.path, config, {group: found for group, found in episodes.items() if found})
+
+
+@dataclasses.dataclass(frozen=True)
+class EpisodePredictions:
+    """The beginning of one test episode, what its model predicted, and with which heads."""
+
+    about: str
+    """Which episode it is, and how to read the numbers."""
+    names: Sequence[str]
+    """Of the observed numbers that are kept: those predicted worst, in their order."""
+    real: Float[np.ndarray, "time_plus_1 obs"]
+    predicted: Float[np.ndarray, "time ahead obs"]
+    """The observations 1 to `AHEAD` steps after each step."""
+    action: Float[np.ndarray, "time action"]
+    heads: Int[np.ndarray, "time member"] | None
+
+
+def predict_episode(run_dir: str | Path) -> EpisodePredictions | None:
+    """Predict along the test episode of median return of a run's last tests.
+
+    None where the run learns nothing, or kept no test episode.
+
+    Args:
+        run_dir: The run directory; nothing in it changes.
+
+    Raises:
+        HeadwayError: As `diagnose`.
+    """
+    run = RunDir(run_dir)
+    tests = [(t, group) for group, found in run.tests().items() for t in found if len(t) > AHEAD]
+    config = run.config() if tests else None
+    if config is None or not config.model.learns:
+        return None
+    whole, group = sorted(tests, key=lambda test: test[0].returns)[len(tests) // 2]
+    shown = {"obs": whole.obs[: LONGEST + 1], "action": whole.action[:LONGEST]}
+    cut = dataclasses.replace(whole, reward=whole.reward[:LONGEST], **shown)
+    model, key = load_agent(run, config).model, jax.random.key(config.evaluation.seed)
+    assert model is not None
+    predicted, heads = predict_along(model, cut, AHEAD, key)
+    off = predicted[: 1 - AHEAD, -1] - cut.obs[AHEAD:]
+    std = cut.obs.std(0)
+    errors = np.sqrt(np.square(off).mean(0)) / np.where(std > 1e-6, std, np.inf)
+    kept = np.sort(np.argsort(-errors, kind="stable")[:MOST])
+    names = dict(enumerate(env_spec(config.env).obs_names))
+    physics = full_label(whole.sim_params, sorted(whole.sim_params))
+    about = (
+        f"The test episode of median return ({whole.returns:,.1f}), {group_label(group)}, {physics};"
+        f" its first {len(cut)} of {len(whole)} steps, and the {len(kept)} of {len(errors)} observed"
+        " numbers that are predicted worst. From every step the model predicts, with what it has"
+        " observed until then, where the episode's own actions lead: means over members, without"
+        " noise. Lines may leave a panel, whose height is that of the real numbers."
+    )
+    return EpisodePredictions(
+        about,
+        [names.get(i, f"observation[{i}]") for i in kept.tolist()],
+        cut.obs[:, kept],
+        predicted[..., kept],
+        cut.action,
+        heads,
+    )
 
 
 def facts(diagnosis: Diagnosis) -> dict[str, Any]:

@@ -7,9 +7,11 @@ Matplotlib settings are put back as soon as one is done.
 
 import contextlib
 import io
+import itertools
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
+from headway.errors import HeadwayError
 from headway.lab import statistics, tables
+from headway.lab.diagnose import AHEAD, EpisodePredictions, predict_episode
 from headway.lab.tables import COLLECTED, TRAIN, group_label
 from headway.training.files import write_bytes
 from headway.training.methods import METHODS
@@ -45,6 +49,12 @@ THEME = {
 """Variables of the page's style sheet, which gives them other colours in the dark."""
 
 Looks = Mapping[str, Mapping[str, Any]]
+EPISODE: Looks = {
+    "real": {"color": FAINT, "alpha": 0.45, "linewidth": 3.4},
+    "predicted one step before": {"color": LABELS[0], "linewidth": 1.2},
+    f"predicted {AHEAD} steps before": {"color": LABELS[1], "linewidth": 1.2, "linestyle": "--"},
+}
+"""Lines of an episode's observed numbers."""
 
 
 @contextlib.contextmanager
@@ -357,8 +367,40 @@ def _learning_curve(axes: Axes, table: pd.DataFrame, looks: Looks) -> None:
     numbers(axes, x="environment steps collected", y="return per episode (sum of rewards)")
 
 
+def episode_panels(found: EpisodePredictions) -> dict[str, Callable[[Axes], None]]:
+    """What draws the observed numbers, actions and heads of an episode over time, by title."""
+
+    def observed(axes: Axes, column: int) -> None:
+        real, (low, high) = found.real[:, column], np.percentile(found.real[:, column], [0, 100])
+        lines = [found.predicted[: len(real) - ahead, ahead - 1, column] for ahead in (1, AHEAD)]
+        for values, style in zip([real, *lines], EPISODE.values(), strict=True):
+            axes.plot(range(len(real) - len(values), len(real)), values, **style)
+        margin = 0.15 * (high - low) or 1.0
+        axes.set_ylim(low - margin, high + margin)
+
+    def actions(axes: Axes) -> None:
+        for values, color in zip(found.action.T, itertools.cycle(LABELS)):
+            axes.step(range(len(values)), values, where="post", color=color, linewidth=1)
+        axes.set_ylim(-1.1, 1.1)
+
+    def heads(axes: Axes, chosen: np.ndarray) -> None:
+        for member, row in enumerate(chosen.T):
+            starts = np.flatnonzero(np.diff(row, prepend=-1))
+            colors = [HEADS[head % len(HEADS)] for head in row[starts]]
+            widths = np.diff(starts, append=len(row))
+            axes.barh(member, widths, 0.82, starts, color=colors, linewidth=0)
+        axes.set_ylim(chosen.shape[1] - 0.5, -0.5)
+        axes.set_ylabel("member")
+
+    panels = {name: partial(observed, column=i) for i, name in enumerate(found.names)}
+    panels["actions, scaled to ±1"] = actions
+    if found.heads is not None and found.heads.any():
+        panels["head that each member plans with"] = partial(heads, chosen=found.heads)
+    return panels
+
+
 def save_run_figures(run_dir: str | Path) -> list[Path]:
-    """Draw every figure that the tables of a run allow, from these files alone.
+    """Draw every figure that the files of a run allow, from these alone.
 
     Args:
         run_dir: A run directory; the PNG files go into its `figures/`.
@@ -435,4 +477,14 @@ def save_run_figures(run_dir: str | Path) -> list[Path]:
         title, looks = "Prediction error by imagined step", group_looks(found.errors.group.unique())
         with frame("prediction_error", title, caption, (6.6, 3.1), named(looks)) as drawing:
             error_lines(drawing.subplots(), found.errors.assign(label=found.errors.group), looks)
+    with contextlib.suppress(HeadwayError):
+        if episode := predict_episode(run_dir):
+            panels, caption = episode_panels(episode), f". {episode.about}"
+            size = (7.6, 1.05 * len(panels) + 0.4)
+            with frame("episode", "Predicted and real over time", caption, size, EPISODE) as drawing:
+                rows = drawing.subplots(len(panels), sharex=True, squeeze=False)
+                for axes, (name, draw) in zip(rows.flat, panels.items(), strict=True):
+                    draw(axes)
+                    axes.set_title(name, pad=2)
+                axes.set_xlabel("step")
     return made

@@ -1,13 +1,13 @@
-"""Error of imagined observations by step."""
+"""Imagined observations against real ones: errors by step, and one episode over time."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from headway.data import Trajectory, sim_params_row
-from headway.models.base import Keys, Model, RecentTransitions, live_through
+from headway.models.base import Keys, Model, RecentTransitions, Transition, live_through
 from headway.planning.rollouts import follow
 
 NUM_STARTS = 256  # imagined rollouts per group in `prediction_error`
@@ -66,3 +66,39 @@ def imagine(
     """Mean prediction of every member along given actions, after living through the past."""
     belief = live_through(model, past, keys, sim_params)
     return follow(model.dynamics(belief), past.next_obs[:, -1], actions)
+
+
+def predict_along(
+    model: Model, trajectory: Trajectory, ahead: int, key: PRNGKeyArray
+) -> tuple[Float[np.ndarray, "time ahead obs"], Int[np.ndarray, "time member"] | None]:
+    """Predict from every step of an episode what its own actions lead to, without noise.
+
+    Args:
+        model: As the agent has it; it goes through the episode as the agent did.
+        trajectory: The episode. Beyond its end its last action goes on.
+        ahead: Imagined steps.
+        key: Draws of a head selection that is random or sampled.
+
+    Returns:
+        The next observations, means over members, and the heads that predict them; None where a
+        model has no heads.
+    """
+    steps, told, names = np.arange(len(trajectory)), None, model.sim_param_names
+    if names:
+        told = jnp.asarray(sim_params_row(trajectory.sim_params, names))[None]
+    windows = trajectory.action[np.minimum(steps[:, None] + np.arange(ahead), steps[-1])]
+    obs, last = trajectory.obs, np.maximum(steps - 1, 0)  # the last step; at the start there is none
+    by_step = map(jnp.asarray, (steps, obs[last], trajectory.action[last], obs[:-1], windows))
+    return jax.tree.map(np.asarray, _predict_along(model, tuple(by_step), told, key))
+
+
+@eqx.filter_jit
+def _predict_along(model: Model, by_step, told, key: PRNGKeyArray):
+    def step(belief, now):
+        time, before, action, obs, ahead = jax.tree.map(lambda x: x[None], now)
+        keys = jax.random.split(jax.random.fold_in(key, time[0]))
+        belief = model.observe(belief, Transition(before, action, obs, time > 0), keys)
+        imagined = follow(model.dynamics(belief), obs, ahead)[:, 0].mean(0)
+        return belief, (imagined, getattr(belief, "heads", [None])[0])
+
+    return jax.lax.scan(step, model.init_belief(1, told), by_step)[1]
