@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -134,64 +134,54 @@ def diagnose(
     return Diagnosis(run.path, config, {group: found for group, found in episodes.items() if found})
 
 
-@dataclasses.dataclass(frozen=True)
-class EpisodePredictions:
+class Followed(NamedTuple):
     """The beginning of one test episode, what its model predicted, and with which heads."""
 
     about: str
     """Which episode it is, and how to read the numbers."""
     names: Sequence[str]
-    """Of the observed numbers that are kept: those predicted worst, in their order."""
+    """Of the observed numbers that are kept."""
     real: Float[np.ndarray, "time_plus_1 obs"]
     predicted: Float[np.ndarray, "time ahead obs"]
     """The observations 1 to `AHEAD` steps after each step."""
     action: Float[np.ndarray, "time action"]
     heads: Int[np.ndarray, "time member"] | None
+    """None where there is no choice."""
 
 
-def predict_episode(run_dir: str | Path) -> EpisodePredictions | None:
-    """Predict along the test episode of median return of a run's last tests.
+def follow_episode(run_dir: str | Path) -> Followed | None:
+    """Predict along the episode of median return of a run's last tests; nothing there changes.
 
     None where the run learns nothing, or kept no test episode.
-
-    Args:
-        run_dir: The run directory; nothing in it changes.
 
     Raises:
         HeadwayError: As `diagnose`.
     """
     run = RunDir(run_dir)
     tests = [(t, group) for group, found in run.tests().items() for t in found if len(t) > AHEAD]
-    config = run.config() if tests else None
-    if config is None or not config.model.learns:
+    if not tests or not (config := run.config()).model.learns:
         return None
     whole, group = sorted(tests, key=lambda test: test[0].returns)[len(tests) // 2]
-    shown = {"obs": whole.obs[: LONGEST + 1], "action": whole.action[:LONGEST]}
-    cut = dataclasses.replace(whole, reward=whole.reward[:LONGEST], **shown)
+    real, action, reward = whole.obs[: LONGEST + 1], whole.action[:LONGEST], whole.reward[:LONGEST]
+    cut = dataclasses.replace(whole, obs=real, action=action, reward=reward)
     model, key = load_agent(run, config).model, jax.random.key(config.evaluation.seed)
     assert model is not None
     predicted, heads = predict_along(model, cut, AHEAD, key)
-    off = predicted[: 1 - AHEAD, -1] - cut.obs[AHEAD:]
-    std = cut.obs.std(0)
-    errors = np.sqrt(np.square(off).mean(0)) / np.where(std > 1e-6, std, np.inf)
+    errors = np.sqrt(np.square(predicted[: 1 - AHEAD, -1] - real[AHEAD:]).mean(0))
+    errors /= np.where(real.std(0) > 1e-6, real.std(0), np.inf)
     kept = np.sort(np.argsort(-errors, kind="stable")[:MOST])
     names = dict(enumerate(env_spec(config.env).obs_names))
-    physics = full_label(whole.sim_params, sorted(whole.sim_params))
     about = (
-        f"The test episode of median return ({whole.returns:,.1f}), {group_label(group)}, {physics};"
-        f" its first {len(cut)} of {len(whole)} steps, and the {len(kept)} of {len(errors)} observed"
-        " numbers that are predicted worst. From every step the model predicts, with what it has"
-        " observed until then, where the episode's own actions lead: means over members, without"
-        " noise. Lines may leave a panel, whose height is that of the real numbers."
+        f"The test episode of median return, {whole.returns:,.1f}: {group_label(group)},"
+        f" {full_label(whole.sim_params, sorted(whole.sim_params))}; {len(cut)} of its"
+        f" {len(whole)} steps, and of {len(errors)} observed numbers the {len(kept)} that are"
+        " predicted worst. From every step the model predicts, with what it has observed until"
+        " then, where the episode's own actions lead: means over members, without noise. Panels"
+        " are as high as the real numbers; a line may leave them."
     )
-    return EpisodePredictions(
-        about,
-        [names.get(i, f"observation[{i}]") for i in kept.tolist()],
-        cut.obs[:, kept],
-        predicted[..., kept],
-        cut.action,
-        heads,
-    )
+    labels = [names.get(i, f"observation[{i}]") for i in kept.tolist()]
+    heads = heads if heads is not None and np.ptp(heads) else None
+    return Followed(about, labels, real[:, kept], predicted[..., kept], action, heads)
 
 
 def facts(diagnosis: Diagnosis) -> dict[str, Any]:

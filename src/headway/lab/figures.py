@@ -26,7 +26,7 @@ from matplotlib.ticker import MaxNLocator
 
 from headway.errors import HeadwayError
 from headway.lab import statistics, tables
-from headway.lab.diagnose import AHEAD, EpisodePredictions, predict_episode
+from headway.lab.diagnose import AHEAD, Followed, follow_episode
 from headway.lab.tables import COLLECTED, TRAIN, group_label
 from headway.training.files import write_bytes
 from headway.training.methods import METHODS
@@ -173,6 +173,12 @@ def group_looks(groups: Sequence[str]) -> dict[str, dict[str, Any]]:
     looks[TRAIN] = {**look(0), "linestyle": "--", "markerfacecolor": "white"}
     looks[COLLECTED] = look(0)
     return {group: looks[group] for group in groups}
+
+
+def head_looks(heads: Any) -> dict[str, dict[str, Any]]:
+    """Looks of the prediction heads in an array, in a legend."""
+    square = {"marker": "s", "markersize": 8, "linestyle": ""}
+    return {f"head {i}": {"color": HEADS[i % len(HEADS)], **square} for i in np.unique(heads)}
 
 
 def numbers(axes: Axes, *, x: str = "", y: str = "") -> None:
@@ -367,21 +373,25 @@ def _learning_curve(axes: Axes, table: pd.DataFrame, looks: Looks) -> None:
     numbers(axes, x="environment steps collected", y="return per episode (sum of rewards)")
 
 
-def episode_panels(found: EpisodePredictions) -> dict[str, Callable[[Axes], None]]:
+def episode_panels(found: Followed) -> dict[str, Callable[[Axes], None]]:
     """What draws the observed numbers, actions and heads of an episode over time, by title."""
 
+    def over_time(axes: Axes, bottom: float, top: float) -> None:
+        axes.set(xlim=(0, len(found.action)), ylim=(bottom, top), xlabel="step")
+        axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+
     def observed(axes: Axes, column: int) -> None:
-        real, (low, high) = found.real[:, column], np.percentile(found.real[:, column], [0, 100])
+        real = found.real[:, column]
         lines = [found.predicted[: len(real) - ahead, ahead - 1, column] for ahead in (1, AHEAD)]
         for values, style in zip([real, *lines], EPISODE.values(), strict=True):
             axes.plot(range(len(real) - len(values), len(real)), values, **style)
-        margin = 0.15 * (high - low) or 1.0
-        axes.set_ylim(low - margin, high + margin)
+        margin = 0.15 * np.ptp(real) or 1.0
+        over_time(axes, real.min() - margin, real.max() + margin)
 
     def actions(axes: Axes) -> None:
         for values, color in zip(found.action.T, itertools.cycle(LABELS)):
-            axes.step(range(len(values)), values, where="post", color=color, linewidth=1)
-        axes.set_ylim(-1.1, 1.1)
+            axes.stairs(values, baseline=None, color=color, linewidth=1)
+        over_time(axes, -1.1, 1.1)
 
     def heads(axes: Axes, chosen: np.ndarray) -> None:
         for member, row in enumerate(chosen.T):
@@ -389,12 +399,12 @@ def episode_panels(found: EpisodePredictions) -> dict[str, Callable[[Axes], None
             colors = [HEADS[head % len(HEADS)] for head in row[starts]]
             widths = np.diff(starts, append=len(row))
             axes.barh(member, widths, 0.82, starts, color=colors, linewidth=0)
-        axes.set_ylim(chosen.shape[1] - 0.5, -0.5)
+        over_time(axes, chosen.shape[1] - 0.5, -0.5)
         axes.set_ylabel("member")
 
     panels = {name: partial(observed, column=i) for i, name in enumerate(found.names)}
     panels["actions, scaled to ±1"] = actions
-    if found.heads is not None and found.heads.any():
+    if found.heads is not None:
         panels["head that each member plans with"] = partial(heads, chosen=found.heads)
     return panels
 
@@ -424,7 +434,6 @@ def save_run_figures(run_dir: str | Path) -> list[Path]:
         return {group_label(group): {**style, **more} for group, style in looks.items()}
 
     last = found.episodes[found.episodes.iteration == found.episodes.iteration.max()]
-    groups = last.group.unique()
     tested = f"{len(last)} test episodes"
     learned = found.curves[found.curves.timesteps > 0]
     if len(learned):
@@ -443,9 +452,10 @@ def save_run_figures(run_dir: str | Path) -> list[Path]:
             f", iteration {last.iteration.max() + 1}. Dots are episodes, bars means; {tested}."
         )
         title, size = "Return on training and unseen physics", (4.0 + 2.6 * len(panels), 3.1)
-        looks = group_looks(groups)
-        key = named(looks, linestyle="", marker="o")
-        with frame("evaluation", title, caption, size, key) as drawing:
+        looks = group_looks(last.group.unique())
+        with frame(
+            "evaluation", title, caption, size, named(looks, linestyle="", marker="o")
+        ) as drawing:
             for i, (name, values) in enumerate(panels.items()):
                 axes = drawing.add_subplot(1, len(panels), i + 1)
                 shown = last.assign(label=last.group, value=values).dropna(subset="value")
@@ -461,11 +471,7 @@ def save_run_figures(run_dir: str | Path) -> list[Path]:
         )
         width = max(1.3 * shares.member.nunique() + 0.6, 5.6)
         size = (width, 0.9 + min(0.3 * shares.sim_params.nunique(), 30.0))
-        square = {"marker": "s", "markersize": 8, "linestyle": ""}
-        looks = {
-            f"head {head}": {"color": HEADS[head % len(HEADS)], **square}
-            for head in sorted(shares["head"].unique())
-        }
+        looks = head_looks(shares["head"])
         with frame("head_shares", "Best head of each physics", caption, size, looks) as drawing:
             head_shares(drawing.subplots(), shares)
     if len(found.errors):
@@ -478,13 +484,14 @@ def save_run_figures(run_dir: str | Path) -> list[Path]:
         with frame("prediction_error", title, caption, (6.6, 3.1), named(looks)) as drawing:
             error_lines(drawing.subplots(), found.errors.assign(label=found.errors.group), looks)
     with contextlib.suppress(HeadwayError):
-        if episode := predict_episode(run_dir):
-            panels, caption = episode_panels(episode), f". {episode.about}"
-            size = (7.6, 1.05 * len(panels) + 0.4)
-            with frame("episode", "Predicted and real over time", caption, size, EPISODE) as drawing:
-                rows = drawing.subplots(len(panels), sharex=True, squeeze=False)
-                for axes, (name, draw) in zip(rows.flat, panels.items(), strict=True):
+        if episode := follow_episode(run_dir):
+            panels = episode_panels(episode)
+            looks = {**EPISODE, **head_looks([] if episode.heads is None else episode.heads)}
+            title, size = "Predicted and real over time", (7.6, 1.05 * len(panels) + 0.4)
+            with frame("episode", title, f". {episode.about}", size, looks) as drawing:
+                rows = drawing.subplots(len(panels), sharex=True)
+                for axes, (name, draw) in zip(rows, panels.items(), strict=True):
                     draw(axes)
                     axes.set_title(name, pad=2)
-                axes.set_xlabel("step")
+                    axes.label_outer()
     return made

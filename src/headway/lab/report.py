@@ -18,13 +18,16 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 from matplotlib.axes import Axes
+from rich.table import Table
 
 import headway
-from headway.errors import ConfigError
-from headway.lab import figures, statistics, tables
+from headway.errors import ConfigError, HeadwayError
+from headway.lab import diagnose, figures, statistics, tables
 from headway.lab.tables import COLLECTED, PHASES, TRAIN, group_label
 from headway.training.files import write_bytes
 
+FILMS = {".gif": "image/gif", ".mp4": "video/mp4"}
+ROOM = 16  # MiB of films on a page
 RAW_COLUMNS = [
     "env", "label", "seed", "group", "sim_params", "episodes", "return_mean", "return_std",
     "score", "run",
@@ -56,6 +59,10 @@ class Page:
     def per_env(self, make: Callable[["Page", str], Block]) -> list[Block]:
         """A block for every environment."""
         return [{"title": env, **make(self, env)} for env in self.envs]
+
+    def title(self, run: Any) -> str:
+        """Name a run, a line of `runs`, for readers."""
+        return ", ".join([run.label, f"seed {run.seed}", *[run.env] * (len(self.envs) > 1)])
 
     def of_env(self, table: pd.DataFrame, env: str) -> pd.DataFrame:
         """Rows of compared runs in one environment."""
@@ -89,18 +96,33 @@ def write_report(runs: Sequence[str | Path], out: str | Path = "report.html") ->
     if not runs:
         raise ConfigError("no run is given, allowed: one or more run directories.")
     page = Page(tables.read_runs(runs))
+    diagnoses, episodes = _examined(page)
     blocks = {
         "results": _results(page),
+        "films": [_films(page)],
         "learning-curves": page.per_env(_curves),
         "physics": page.per_env(_physics),
         "improvement": [_improvement(page)],
         "head-shares": page.per_env(_head_shares),
+        "diagnosis": diagnoses,
+        "episode": episodes,
         "prediction-error": page.per_env(_prediction_error),
         "settings": page.per_env(_settings),
         "times": page.per_env(_times),
         "runs": [_runs(page)],
         "numbers": [_numbers(page)],
     }
+
+    def filled(block: Block) -> bool:
+        """Whether it holds more than remarks."""
+        return bool(block.get("panels") or block.get("table", {}).get("lines"))
+
+    heads = range(min(page.found.assignments["head"].nunique(), len(figures.HEADS)))
+    keys = {"head-shares": [(f"h{head}", f"head {head}") for head in heads]}
+    keys["episode"] = [
+        *zip(("faint", "s0", "s1"), figures.EPISODE, strict=True),
+        *keys["head-shares"],
+    ]
 
     def symbol(axes: Axes, look: dict[str, Any]) -> None:
         """Draw a piece of line with one marker."""
@@ -118,9 +140,13 @@ def write_report(runs: Sequence[str | Path], out: str | Path = "report.html") ->
             for look in page.looks.values()
         ],
         notes=page.found.notes,
-        blocks=blocks,
+        blocks={
+            name: [block for block in found if filled(block) or block.get("texts")]
+            for name, found in blocks.items()
+            if any(map(filled, found))
+        },
+        keys=keys,
         theme=figures.THEME,
-        heads=min(page.found.assignments["head"].nunique(), len(figures.HEADS)),
         version=headway.__version__,
         command=shlex.join(["headway", "report", *map(str, runs), "-o", str(out)]),
         svg=Markup,
@@ -184,7 +210,7 @@ def _mismatches(page: Page, env: str | None = None) -> list[str]:
 def _results_of(page: Page, env: str) -> Block:
     own = page.of_env(page.parts, env)
     if own.empty:
-        return {"texts": ["No run is finished yet."]}
+        return {}
     form = "{:.2f}" if env in page.scored else "{:,.1f}"
     lines = []
     for label in (label for label in page.looks if label in set(own.label)):
@@ -257,13 +283,17 @@ def _curves(page: Page, env: str) -> Block:
 
 def _physics(page: Page, env: str) -> Block:
     own = page.of_env(page.parts, env)
-    if own.empty:
-        return {"texts": ["No run is finished yet."]}
-    name = "score" if env in page.scored else "return per episode"
+    several, panels = own["run"].nunique() > 1, []
     shown = {label: look for label, look in page.looks.items() if label in set(own.label)}
-    draw = partial(figures.by_physics, table=own, looks=shown, name=name, joined=True)
-    panels = [page.panel(f"{name} by physics", draw, env, size=(3.7, 3.05))]
-    for group in _groups(own):
+    columns = {"score": "score"} if env in page.scored else {}
+    columns["return per episode"] = "return_mean" if several else "return"
+    table = own if several else page.of_env(page.found.final, env)
+    for name, column in columns.items() if shown else ():
+        values = table.assign(value=table[column])
+        draw = partial(figures.by_physics, table=values, looks=shown, name=name, joined=several)
+        panels.append(page.panel(f"{name} by physics", draw, env, size=(3.7, 3.05)))
+    name = next(iter(columns))
+    for group in _groups(own) if several else ():
         values = own[own.group == group].groupby(["label", "run"]).value.mean().reset_index()
         draw = partial(figures.dots, table=values, looks=shown, name=name)
         size = (3.7, 0.9 + 0.265 * len(shown))
@@ -281,9 +311,7 @@ def _improvement(page: Page) -> Block:
             found[first, second] = shown
             found[second, first] = dataclasses.replace(shown, value=1 - shown.value, interval=ends)
     if not found:
-        one = "There is one method only: nothing to compare."
-        none = "No two methods were tested on the same unseen physics."
-        return {"texts": [one if len(labels) == 1 else none, *_mismatches(page)]}
+        return {}
     lines = [
         page.line(first, *(_estimate(found.get((first, second))) for second in labels))
         for first in labels
@@ -305,7 +333,58 @@ def _head_shares(page: Page, env: str) -> Block:
             panels.append(
                 page.panel(title, partial(figures.head_shares, table=own), env, size=size)
             )
-    return {"panels": panels, "texts": [] if panels else ["No method with several heads."]}
+    return {"panels": panels}
+
+
+def _examined(page: Page) -> tuple[list[Block], list[Block]]:
+    """Diagnoses and episodes, of the first run of each label that kept its model and tests."""
+    diagnoses: list[Block] = []
+    episodes: list[Block] = []
+    for run in page.runs.drop_duplicates(["env", "label"]).itertuples():
+        path = str(run.run)
+        if not any(Path(path).glob("tests/*")):
+            continue
+        try:
+            if page.found.settings[path].get("model.kind") == "multi-headed":
+                shown = diagnose.tables(diagnose.diagnose(path))
+                diagnoses += [_table_of(table, page.title(run)) for table in shown]
+            if (found := diagnose.follow_episode(path)) is not None:
+                panels = figures.episode_panels(found).items()
+                panels = [page.panel(*panel, run.env, size=(3.7, 1.9)) for panel in panels]
+                episodes.append(
+                    {"title": page.title(run), "panels": panels, "texts": [found.about]}
+                )
+        except HeadwayError as error:
+            page.found.notes.append((path, f"cannot be gone through again: {error}"))
+    return diagnoses, episodes
+
+
+def _table_of(table: Table, owner: str) -> Block:
+    """A table of the terminal, of a run."""
+    rows = zip(*(column.cells for column in table.columns), strict=True)
+    lines = [{"series": None, "cells": [c.replace("  ", "\u2003") for c in row]} for row in rows]
+    numbers = [i for i, column in enumerate(table.columns) if column.justify == "right"]
+    shown = _table([str(column.header) for column in table.columns], lines, numbers)
+    title = f"{owner}: {str(table.title).partition(':')[0].lower()}"
+    return {"title": title, "table": shown, "texts": [str(table.caption)]}
+
+
+def _films(page: Page) -> Block:
+    """The newest film of every run, as long as the page has room."""
+    panels, texts, room = [], [], ROOM * 2**20
+    for run in page.runs.itertuples():
+        films = [file for file in Path(str(run.run)).iterdir() if file.suffix.lower() in FILMS]
+        if not films:
+            continue
+        newest = max(films, key=lambda file: file.stat().st_mtime)
+        if (size := newest.stat().st_size) > room:
+            texts.append(f"{newest} is left out: films on a page have {ROOM} MiB in all.")
+            continue
+        room -= size
+        content = base64.b64encode(newest.read_bytes()).decode()
+        film = f"data:{FILMS[newest.suffix.lower()]};base64,{content}"
+        panels.append({"title": page.title(run), "film": film})
+    return {"panels": panels, "texts": texts}
 
 
 def _prediction_error(page: Page, env: str) -> Block:
@@ -314,7 +393,7 @@ def _prediction_error(page: Page, env: str) -> Block:
     for group in _groups(own):
         draw = partial(figures.error_lines, table=own[own.group == group], looks=page.looks)
         panels.append(page.panel(group_label(group), draw, env))
-    return {"panels": panels, "texts": [] if panels else ["No prediction errors."]}
+    return {"panels": panels}
 
 
 def _settings(page: Page, env: str) -> Block:
@@ -324,8 +403,7 @@ def _settings(page: Page, env: str) -> Block:
     for name in tables.differing(list(settings.values()), unless=("method", "seed")):
         values = (tables.value_text(table.get(name)) for table in settings.values())
         lines.append({"series": None, "cells": [name, *values]})
-    texts = [] if lines else ["All runs have the same settings."]
-    return {"table": {**_table(["setting", *settings], lines), "code": 0}, "texts": texts}
+    return {"table": {**_table(["setting", *settings], lines), "code": 0}}
 
 
 def _times(page: Page, env: str) -> Block:
@@ -340,8 +418,7 @@ def _times(page: Page, env: str) -> Block:
         bar = {"widths": [100 * value / longest for value in minutes]}
         lines.append(page.line(str(label), *numbers, bar, device))
     columns = ["method", *(f"{phase}, min" for phase in PHASES), "all, min", "", "device"]
-    texts = [] if lines else ["No run is finished yet."]
-    return {"table": _table(columns, lines, range(1, 5)), "texts": texts}
+    return {"table": _table(columns, lines, range(1, 5))}
 
 
 def _runs(page: Page) -> Block:

@@ -83,22 +83,18 @@ def predict_along(
         The next observations, means over members, and the heads that predict them; None where a
         model has no heads.
     """
-    steps, told, names = np.arange(len(trajectory)), None, model.sim_param_names
-    if names:
-        told = jnp.asarray(sim_params_row(trajectory.sim_params, names))[None]
+    names, steps = model.sim_param_names, np.arange(len(trajectory))
+    told = jnp.asarray(sim_params_row(trajectory.sim_params, names))[None] if names else None
+    past = np.maximum(steps - 1, 0)  # at the start it did not happen
     windows = trajectory.action[np.minimum(steps[:, None] + np.arange(ahead), steps[-1])]
-    obs, last = trajectory.obs, np.maximum(steps - 1, 0)  # the last step; at the start there is none
-    by_step = map(jnp.asarray, (steps, obs[last], trajectory.action[last], obs[:-1], windows))
-    return jax.tree.map(np.asarray, _predict_along(model, tuple(by_step), told, key))
+    moments = steps, trajectory.obs[past], trajectory.action[past], trajectory.obs[:-1], windows
 
-
-@eqx.filter_jit
-def _predict_along(model: Model, by_step, told, key: PRNGKeyArray):
-    def step(belief, now):
-        time, before, action, obs, ahead = jax.tree.map(lambda x: x[None], now)
+    def step(belief, moment):
+        time, before, action, obs, actions = jax.tree.map(lambda x: x[None], moment)
         keys = jax.random.split(jax.random.fold_in(key, time[0]))
         belief = model.observe(belief, Transition(before, action, obs, time > 0), keys)
-        imagined = follow(model.dynamics(belief), obs, ahead)[:, 0].mean(0)
+        imagined = follow(model.dynamics(belief), obs, actions)[:, 0].mean(0)
         return belief, (imagined, getattr(belief, "heads", [None])[0])
 
-    return jax.lax.scan(step, model.init_belief(1, told), by_step)[1]
+    found = jax.lax.scan(step, model.init_belief(1, told), jax.tree.map(jnp.asarray, moments))[1]
+    return jax.tree.map(np.asarray, found)
