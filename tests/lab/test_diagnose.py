@@ -69,7 +69,7 @@ def test_only_trained_runs_with_heads_are_diagnosed(tmp_path, method, words, sai
     assert said in capsys.readouterr().err
 
 
-def test_the_tests_of_a_run_are_not_run_again(reference, monkeypatch):
+def test_the_tests_of_a_run_are_not_run_again(reference, two_iterations, monkeypatch):
     run = RunDir(reference)
     returns = [t.returns for found in run.tests().values() for t in found]
     assert returns == [row.episode_return for row in run.evaluation() if row.iteration == 2]
@@ -79,6 +79,7 @@ def test_the_tests_of_a_run_are_not_run_again(reference, monkeypatch):
         counts = {group: len(episodes) for group, episodes in found.episodes.items()}
         assert counts == {"train": 2, "low": 2, "high": 2}
         assert list(headway.diagnose(reference, groups=["high"]).episodes) == ["high"]
+        assert list(headway.diagnose(two_iterations).episodes) == ["low", "high"]  # a stopped run
         with pytest.raises(UnknownNameError):
             headway.diagnose(reference, groups=["hihg"])
     again = headway.diagnose(reference, groups=["high"], num_episodes=1)

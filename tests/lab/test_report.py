@@ -3,6 +3,7 @@
 import base64
 import html
 import io
+import os
 import re
 import shutil
 
@@ -13,6 +14,7 @@ import pytest
 from PIL import Image
 
 from headway.errors import ConfigError
+from headway.lab import diagnose
 from headway.lab.report import write_report
 
 CHAPTERS = [
@@ -48,7 +50,7 @@ def made(written, tmp_path_factory):
     return report(root)
 
 
-def test_the_page_holds_every_chapter_and_needs_nothing_else(made):
+def test_the_page_holds_every_chapter_of_tables_and_needs_nothing_else(made):
     page = made.read_text()
     assert re.findall(r'<section id="([\w-]+)">', page) == CHAPTERS
     for name in ("learning-curves", "physics", "head-shares", "prediction-error"):
@@ -77,6 +79,33 @@ def test_results_and_claims_are_those_of_the_numbers(made):
     assert "3 of 5 iterations are finished" in text_of(page)
 
 
+def test_a_trained_run_has_its_film_diagnosis_and_episode(reference, tmp_path, monkeypatch):
+    path = shutil.copytree(reference, tmp_path / "runs/a")
+    for age, name in enumerate(["new.mp4", "old.gif"]):
+        (path / name).write_bytes(name.encode())
+        os.utime(path / name, (1e9 - age, 1e9 - age))
+    page = report(tmp_path / "runs").read_text()
+    assert re.findall(r'<section id="([\w-]+)">', page) == [
+        "results", "films", "learning-curves", "physics", "head-shares", "diagnosis", "episode",
+        "times", "runs", "numbers",
+    ]  # fmt: skip
+    film = base64.b64encode(b"new.mp4").decode()
+    assert re.findall(r'src="([^"]*)"', page) == [f"data:video/mp4;base64,{film}"]
+    said = text_of(section(page, "diagnosis"))
+    for table in diagnose.tables(diagnose.diagnose(reference)):
+        for cells in zip(*(column.cells for column in table.columns), strict=True):
+            assert " ".join(" ".join(cells).split()) in said
+    assert len(re.findall("<figure>", section(page, "episode"))) == 5
+    assert "return per episode by physics" in section(page, "physics")
+
+    monkeypatch.setattr("headway.lab.report.ROOM", 0)
+    (path / "tests/iteration-002.safetensors").write_bytes(b"")
+    page = report(tmp_path / "runs").read_text()
+    for name, note in (("films", "new.mp4 is left out"), ("diagnosis", "no diagnosis: ")):
+        assert f'"{name}"' not in page
+        assert f"<code>{path}</code> {note}" in page
+
+
 def test_few_seeds_have_no_interval_and_no_claim(tmp_path):
     for method in ("tmcl", "pets"):
         fakes.write(tmp_path / f"runs/{method}", method, lift=len(method))
@@ -87,13 +116,13 @@ def test_few_seeds_have_no_interval_and_no_claim(tmp_path):
     assert "is better than" not in page
 
 
-def test_nothing_finished_has_every_chapter(run_dir):
+def test_nothing_finished_leaves_chapters_out(run_dir):
     for name in ("metrics.jsonl", "evaluation.csv", "assignments.csv", "prediction_error.csv"):
         (run_dir / name).write_bytes(b"\xff no\n")
     page = report(run_dir).read_text()
     assert page.count(f"<li><code>{run_dir}</code>") == 5  # one for each, and what is missing
-    assert "No run is finished yet." in page
-    assert re.findall(r'<section id="([\w-]+)">', page) == CHAPTERS
+    assert re.findall(r'<section id="([\w-]+)">', page) == ["runs"]
+    assert re.findall(r'<a href="#([\w-]+)">', page) == ["runs"]
     with pytest.raises(ConfigError, match="no run is given"):
         write_report([])
 

@@ -172,7 +172,7 @@ def test_imagining_lives_through_the_past_first(model):
     slots = [jnp.stack([step[i] for step in steps], 1) for i in range(3)]
     actions = jnp.asarray(np.random.default_rng(4).uniform(-1, 1, (2, 2, 2)), jnp.float32)
     young = RecentTransitions(*slots, jnp.array([5, 3]))
-    found = imagine(model, young, actions, KEYS)[0, :, 0]
+    found = imagine(model, young, actions, KEYS)[0][0, :, 0]
     for env, count in ((0, 5), (1, 3)):
         belief = live(model, steps[5 - count :])
         close(found[env], step_of(model, belief, steps[-1].next_obs, actions[:, 0])[env])

@@ -1,13 +1,11 @@
-"""What a trained run predicts: head selection and calibration, and one episode over time."""
+"""Head selection and calibration of a trained run, as tables and as plain values."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import numpy as np
-from jaxtyping import Float, Int
 from rich.console import Group
 from rich.jupyter import JupyterMixin
 from rich.table import Table
@@ -17,18 +15,13 @@ from headway.data import Trajectory
 from headway.errors import ConfigError
 from headway.lab.tables import COLLECTED, distinct, full_label, group_label, new_table, varying
 from headway.models.multi_headed import MultiHeadModel
-from headway.task import env_spec, sim_param_sets
+from headway.task import sim_param_sets
 from headway.training import selection
-from headway.training.diagnostics import predict_along
 from headway.training.evaluate import evaluate, known_groups
 from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
-from headway.training.recordings import HELD_OUT
 from headway.training.run import RunDir
 from headway.training.trainers import load_agent
-
-AHEAD = 5  # steps from one prediction of an episode to its moment
-LONGEST, MOST = 200, 6  # steps and observed numbers that are legible
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +74,7 @@ def diagnose(
 
     Args:
         run_dir: The run directory.
-        groups: `"train"` or unseen groups; all of them by default.
+        groups: `"train"` or unseen groups; by default those that the run was tested with.
         num_episodes: Episodes per group to run tests with; by default those of the run are taken.
         collected: Take the episodes that the last iteration collected instead. The model has
             learned from these since.
@@ -115,8 +108,7 @@ def diagnose(
         fits = run.last_iteration < rounds  # of recordings, all kept with the first iteration
         trajectories = {COLLECTED: run.iteration_data(0 if fits else run.last_iteration)}
     elif num_episodes is None and (kept := run.tests()):
-        own = HELD_OUT in kept and not groups  # a fit's recordings, where it has tested nothing
-        wanted = [HELD_OUT] if own else known_groups(groups, sim_param_sets(config).group_names)
+        wanted = known_groups(groups, sim_param_sets(config).group_names) if groups else [*kept]
         if kept.keys() >= set(wanted):
             trajectories = {group: kept[group] for group in wanted}
     if not trajectories:
@@ -134,56 +126,6 @@ def diagnose(
     return Diagnosis(run.path, config, {group: found for group, found in episodes.items() if found})
 
 
-class Followed(NamedTuple):
-    """The beginning of one test episode, what its model predicted, and with which heads."""
-
-    about: str
-    """Which episode it is, and how to read the numbers."""
-    names: Sequence[str]
-    """Of the observed numbers that are kept."""
-    real: Float[np.ndarray, "time_plus_1 obs"]
-    predicted: Float[np.ndarray, "time ahead obs"]
-    """The observations 1 to `AHEAD` steps after each step."""
-    action: Float[np.ndarray, "time action"]
-    heads: Int[np.ndarray, "time member"] | None
-    """None where there is no choice."""
-
-
-def follow_episode(run_dir: str | Path) -> Followed | None:
-    """Predict along the episode of median return of a run's last tests; nothing there changes.
-
-    None where the run learns nothing, or kept no test episode.
-
-    Raises:
-        HeadwayError: As `diagnose`.
-    """
-    run = RunDir(run_dir)
-    tests = [(t, group) for group, found in run.tests().items() for t in found if len(t) > AHEAD]
-    if not tests or not (config := run.config()).model.learns:
-        return None
-    whole, group = sorted(tests, key=lambda test: test[0].returns)[len(tests) // 2]
-    real, action, reward = whole.obs[: LONGEST + 1], whole.action[:LONGEST], whole.reward[:LONGEST]
-    cut = dataclasses.replace(whole, obs=real, action=action, reward=reward)
-    model, key = load_agent(run, config).model, jax.random.key(config.evaluation.seed)
-    assert model is not None
-    predicted, heads = predict_along(model, cut, AHEAD, key)
-    errors = np.sqrt(np.square(predicted[: 1 - AHEAD, -1] - real[AHEAD:]).mean(0))
-    errors /= np.where(real.std(0) > 1e-6, real.std(0), np.inf)
-    kept = np.sort(np.argsort(-errors, kind="stable")[:MOST])
-    names = dict(enumerate(env_spec(config.env).obs_names))
-    about = (
-        f"The test episode of median return, {whole.returns:,.1f}: {group_label(group)},"
-        f" {full_label(whole.sim_params, sorted(whole.sim_params))}; {len(cut)} of its"
-        f" {len(whole)} steps, and of {len(errors)} observed numbers the {len(kept)} that are"
-        " predicted worst. From every step the model predicts, with what it has observed until"
-        " then, where the episode's own actions lead: means over members, without noise. Panels"
-        " are as high as the real numbers; a line may leave them."
-    )
-    labels = [names.get(i, f"observation[{i}]") for i in kept.tolist()]
-    heads = heads if heads is not None and np.ptp(heads) else None
-    return Followed(about, labels, real[:, kept], predicted[..., kept], action, heads)
-
-
 def facts(diagnosis: Diagnosis) -> dict[str, Any]:
     """The diagnosis as plain values, for JSON."""
 
@@ -195,8 +137,7 @@ def facts(diagnosis: Diagnosis) -> dict[str, Any]:
     for group in diagnosis.episodes:
         physics = [{"sim_params": p, **plain(found)} for p, found in diagnosis.by_physics(group)]
         groups.append({"group": group, **plain(diagnosis.summary(group)), "physics": physics})
-    settled_after = {"settled_after": diagnosis.window}
-    return {"run_dir": str(diagnosis.path), **settled_after, "groups": groups}
+    return {"run_dir": str(diagnosis.path), "settled_after": diagnosis.window, "groups": groups}
 
 
 def tables(diagnosis: Diagnosis) -> list[Table]:

@@ -7,11 +7,9 @@ Matplotlib settings are put back as soon as one is done.
 
 import contextlib
 import io
-import itertools
 import re
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from headway.errors import HeadwayError
-from headway.lab import statistics, tables
-from headway.lab.diagnose import AHEAD, Followed, follow_episode
+from headway.lab import episode, statistics, tables
 from headway.lab.tables import COLLECTED, TRAIN, group_label
 from headway.training.files import write_bytes
 from headway.training.methods import METHODS
@@ -38,7 +34,7 @@ STYLE = matplotlib.rc_params_from_file(
 )
 INK, FAINT, RULE = STYLE["text.color"], STYLE["xtick.color"], STYLE["grid.color"]
 GROUND = "#f4f4f4"
-LABELS = ("#0072b2", "#d55e00", "#009e73", "#b0578d", "#c98a00", "#3f3f46", "#4aa3d6", "#8a7a00")
+LABELS = STYLE["axes.prop_cycle"].by_key()["color"]
 MARKERS, DASHES = "osD^vPX*", ("-", "--", ":")
 THEME = {
     **{"ink": INK, "faint": FAINT, "rule": RULE, "axis": STYLE["axes.edgecolor"]},
@@ -49,12 +45,6 @@ THEME = {
 """Variables of the page's style sheet, which gives them other colours in the dark."""
 
 Looks = Mapping[str, Mapping[str, Any]]
-EPISODE: Looks = {
-    "real": {"color": FAINT, "alpha": 0.45, "linewidth": 3.4},
-    "predicted one step before": {"color": LABELS[0], "linewidth": 1.2},
-    f"predicted {AHEAD} steps before": {"color": LABELS[1], "linewidth": 1.2, "linestyle": "--"},
-}
-"""Lines of an episode's observed numbers."""
 
 
 @contextlib.contextmanager
@@ -173,12 +163,6 @@ def group_looks(groups: Sequence[str]) -> dict[str, dict[str, Any]]:
     looks[TRAIN] = {**look(0), "linestyle": "--", "markerfacecolor": "white"}
     looks[COLLECTED] = look(0)
     return {group: looks[group] for group in groups}
-
-
-def head_looks(heads: Any) -> dict[str, dict[str, Any]]:
-    """Looks of the prediction heads in an array, in a legend."""
-    square = {"marker": "s", "markersize": 8, "linestyle": ""}
-    return {f"head {i}": {"color": HEADS[i % len(HEADS)], **square} for i in np.unique(heads)}
 
 
 def numbers(axes: Axes, *, x: str = "", y: str = "") -> None:
@@ -373,42 +357,6 @@ def _learning_curve(axes: Axes, table: pd.DataFrame, looks: Looks) -> None:
     numbers(axes, x="environment steps collected", y="return per episode (sum of rewards)")
 
 
-def episode_panels(found: Followed) -> dict[str, Callable[[Axes], None]]:
-    """What draws the observed numbers, actions and heads of an episode over time, by title."""
-
-    def over_time(axes: Axes, bottom: float, top: float) -> None:
-        axes.set(xlim=(0, len(found.action)), ylim=(bottom, top), xlabel="step")
-        axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-
-    def observed(axes: Axes, column: int) -> None:
-        real = found.real[:, column]
-        lines = [found.predicted[: len(real) - ahead, ahead - 1, column] for ahead in (1, AHEAD)]
-        for values, style in zip([real, *lines], EPISODE.values(), strict=True):
-            axes.plot(range(len(real) - len(values), len(real)), values, **style)
-        margin = 0.15 * np.ptp(real) or 1.0
-        over_time(axes, real.min() - margin, real.max() + margin)
-
-    def actions(axes: Axes) -> None:
-        for values, color in zip(found.action.T, itertools.cycle(LABELS)):
-            axes.stairs(values, baseline=None, color=color, linewidth=1)
-        over_time(axes, -1.1, 1.1)
-
-    def heads(axes: Axes, chosen: np.ndarray) -> None:
-        for member, row in enumerate(chosen.T):
-            starts = np.flatnonzero(np.diff(row, prepend=-1))
-            colors = [HEADS[head % len(HEADS)] for head in row[starts]]
-            widths = np.diff(starts, append=len(row))
-            axes.barh(member, widths, 0.82, starts, color=colors, linewidth=0)
-        over_time(axes, chosen.shape[1] - 0.5, -0.5)
-        axes.set_ylabel("member")
-
-    panels = {name: partial(observed, column=i) for i, name in enumerate(found.names)}
-    panels["actions, scaled to ±1"] = actions
-    if found.heads is not None:
-        panels["head that each member plans with"] = partial(heads, chosen=found.heads)
-    return panels
-
-
 def save_run_figures(run_dir: str | Path) -> list[Path]:
     """Draw every figure that the files of a run allow, from these alone.
 
@@ -469,9 +417,15 @@ def save_run_figures(run_dir: str | Path) -> list[Path]:
             " of each physics whose oracle loss is lowest under each head. Head numbers are"
             " arbitrary: head 0 of one member has nothing to do with head 0 of another."
         )
-        width = max(1.3 * shares.member.nunique() + 0.6, 5.6)
-        size = (width, 0.9 + min(0.3 * shares.sim_params.nunique(), 30.0))
-        looks = head_looks(shares["head"])
+        size = (
+            max(1.3 * shares.member.nunique() + 0.6, 5.6),
+            0.9 + min(0.3 * shares.sim_params.nunique(), 30.0),
+        )
+        square = {"marker": "s", "markersize": 8, "linestyle": ""}
+        looks = {
+            f"head {head}": {"color": HEADS[head % len(HEADS)], **square}
+            for head in sorted(shares["head"].unique())
+        }
         with frame("head_shares", "Best head of each physics", caption, size, looks) as drawing:
             head_shares(drawing.subplots(), shares)
     if len(found.errors):
@@ -483,15 +437,13 @@ def save_run_figures(run_dir: str | Path) -> list[Path]:
         title, looks = "Prediction error by imagined step", group_looks(found.errors.group.unique())
         with frame("prediction_error", title, caption, (6.6, 3.1), named(looks)) as drawing:
             error_lines(drawing.subplots(), found.errors.assign(label=found.errors.group), looks)
-    with contextlib.suppress(HeadwayError):
-        if episode := follow_episode(run_dir):
-            panels = episode_panels(episode)
-            looks = {**EPISODE, **head_looks([] if episode.heads is None else episode.heads)}
-            title, size = "Predicted and real over time", (7.6, 1.05 * len(panels) + 0.4)
-            with frame("episode", title, f". {episode.about}", size, looks) as drawing:
-                rows = drawing.subplots(len(panels), sharex=True)
-                for axes, (name, draw) in zip(rows, panels.items(), strict=True):
-                    draw(axes)
-                    axes.set_title(name, pad=2)
-                    axes.label_outer()
+    about, panels = episode.follow_episode(run_dir)
+    if panels:
+        title, size = "Predicted and real over time", (7.6, 1.05 * len(panels) + 0.4)
+        with frame("episode", title, f". {about}", size, episode.LOOKS) as drawing:
+            rows = drawing.subplots(len(panels), sharex=True)
+            for axes, (name, draw) in zip(rows, panels.items(), strict=True):
+                draw(axes)
+                axes.set_title(name, pad=2)
+                axes.label_outer()
     return made

@@ -22,16 +22,18 @@ from rich.table import Table
 
 import headway
 from headway.errors import ConfigError, HeadwayError
-from headway.lab import diagnose, figures, statistics, tables
+from headway.lab import diagnose, episode, figures, statistics, tables
 from headway.lab.tables import COLLECTED, PHASES, TRAIN, group_label
 from headway.training.files import write_bytes
 
 FILMS = {".gif": "image/gif", ".mp4": "video/mp4"}
 ROOM = 16  # MiB of films on a page
-RAW_COLUMNS = [
-    "env", "label", "seed", "group", "sim_params", "episodes", "return_mean", "return_std",
-    "score", "run",
-]  # fmt: skip
+RAW = {
+    "label": "method", "env": "environment", "seed": "seed", "group": "group",
+    "sim_params": "physics", "episodes": "episodes", "return_mean": "mean return",
+    "return_std": "standard deviation", "score": "score",
+}  # fmt: skip
+"""Columns of the raw numbers, and what they are called on the page."""
 
 Block = dict[str, Any]
 Cell = str | tuple[str, ...]  # a text, and smaller ones below it
@@ -49,8 +51,7 @@ class Page:
             str(label): {**figures.look(i), "gid": f"series-{i}"} for i, label in enumerate(labels)
         }
         self.parts = tables.by_physics(found.final[found.final["run"].isin(self.runs["run"])])
-        known = self.parts.groupby("env").score.agg(lambda scores: scores.notna().all())
-        self.scored = set(known[known].index)
+        self.scored = {env for env, own in self.parts.groupby("env") if own.score.notna().all()}
         # The score where it is known for a whole environment, else the return.
         scored = self.parts.env.isin(self.scored)
         self.parts["value"] = self.parts.score.where(scored, self.parts.return_mean)
@@ -117,13 +118,6 @@ def write_report(runs: Sequence[str | Path], out: str | Path = "report.html") ->
         """Whether it holds more than remarks."""
         return bool(block.get("panels") or block.get("table", {}).get("lines"))
 
-    heads = range(min(page.found.assignments["head"].nunique(), len(figures.HEADS)))
-    keys = {"head-shares": [(f"h{head}", f"head {head}") for head in heads]}
-    keys["episode"] = [
-        *zip(("faint", "s0", "s1"), figures.EPISODE, strict=True),
-        *keys["head-shares"],
-    ]
-
     def symbol(axes: Axes, look: dict[str, Any]) -> None:
         """Draw a piece of line with one marker."""
         axes.plot([0, 1, 2], [0, 0, 0], **{**look, "gid": None, "markersize": 5, "markevery": [1]})
@@ -140,12 +134,8 @@ def write_report(runs: Sequence[str | Path], out: str | Path = "report.html") ->
             for look in page.looks.values()
         ],
         notes=page.found.notes,
-        blocks={
-            name: [block for block in found if filled(block) or block.get("texts")]
-            for name, found in blocks.items()
-            if any(map(filled, found))
-        },
-        keys=keys,
+        blocks={name: found for name, found in blocks.items() if any(map(filled, found))},
+        heads=min(page.found.assignments["head"].nunique(), len(figures.HEADS)),
         theme=figures.THEME,
         version=headway.__version__,
         command=shlex.join(["headway", "report", *map(str, runs), "-o", str(out)]),
@@ -221,9 +211,8 @@ def _results_of(page: Page, env: str) -> Block:
             if env in page.scored and len(column):
                 below = f"return {_number(returns[group].mean(), '{:,.0f}')}"
                 below += f" ± {returns[group].std():,.0f}" if len(column) > 1 else ""
-            cells.append(
-                _estimate(statistics.estimate([column]), form, below) if len(column) else "–"
-            )
+            found = statistics.estimate([column]) if len(column) else None
+            cells.append(_estimate(found, form, below))
         seeds = f"{len(values)} seed{'s' * (len(values) != 1)}"
         lines.append(page.line(label, *cells, below=seeds))
     references = page.found.runs[page.found.runs.is_reference & (page.found.runs.env == env)]
@@ -262,11 +251,10 @@ def _curves(page: Page, env: str) -> Block:
     own = own.assign(finished=own["run"].isin(page.found.finished))
     references = ~page.found.final["run"].isin(page.runs["run"])
     levels = tables.by_group(page.found.final[references & (page.found.final.env == env)])
-    panels, once = [], []
+    panels = []
     for group in sorted(own.group.unique(), key=lambda group: group != COLLECTED):
         table, here = own[own.group == group], levels[levels.group == group]
-        if not table.duplicated("run").any():
-            once.append(group_label(group))
+        if not table.duplicated("run").any():  # tested once is no curve
             continue
 
         def draw(axes: Axes, table: pd.DataFrame = table, here: pd.DataFrame = here) -> None:
@@ -277,25 +265,20 @@ def _curves(page: Page, env: str) -> Block:
                 axes.text(0.995, level, str(method), transform=axes.get_yaxis_transform(), **style)
 
         panels.append(page.panel(group_label(group), draw, env))
-    texts = [f"Measured after one iteration at most, so no curve: {'; '.join(once)}."]
-    return {"panels": panels, "texts": texts * bool(once)}
+    return {"panels": panels}
 
 
 def _physics(page: Page, env: str) -> Block:
     own = page.of_env(page.parts, env)
-    several, panels = own["run"].nunique() > 1, []
     shown = {label: look for label, look in page.looks.items() if label in set(own.label)}
-    columns = {"score": "score"} if env in page.scored else {}
-    columns["return per episode"] = "return_mean" if several else "return"
-    table = own if several else page.of_env(page.found.final, env)
-    for name, column in columns.items() if shown else ():
-        values = table.assign(value=table[column])
-        draw = partial(figures.by_physics, table=values, looks=shown, name=name, joined=several)
+    panels, names = [], ["score"] * (env in page.scored) + ["return per episode"]
+    for name in names if shown else ():
+        table = own if name == "score" else own.assign(value=own.return_mean)
+        draw = partial(figures.by_physics, table=table, looks=shown, name=name, joined=True)
         panels.append(page.panel(f"{name} by physics", draw, env, size=(3.7, 3.05)))
-    name = next(iter(columns))
-    for group in _groups(own) if several else ():
+    for group in _groups(own) if own["run"].nunique() > 1 else ():
         values = own[own.group == group].groupby(["label", "run"]).value.mean().reset_index()
-        draw = partial(figures.dots, table=values, looks=shown, name=name)
+        draw = partial(figures.dots, table=values, looks=shown, name=names[0])
         size = (3.7, 0.9 + 0.265 * len(shown))
         panels.append(page.panel(group_label(group), draw, env, size=size))
     return {"panels": panels}
@@ -330,32 +313,25 @@ def _head_shares(page: Page, env: str) -> Block:
         if own["head"].nunique() > 1:
             title = f"{own.label.iloc[0]}, seed {own.seed.iloc[0]}"
             size = (3.7, 0.8 + 0.25 * own.sim_params.nunique())
-            panels.append(
-                page.panel(title, partial(figures.head_shares, table=own), env, size=size)
-            )
+            draw = partial(figures.head_shares, table=own)
+            panels.append(page.panel(title, draw, env, size=size))
     return {"panels": panels}
 
 
 def _examined(page: Page) -> tuple[list[Block], list[Block]]:
     """Diagnoses and episodes, of the first run of each label that kept its model and tests."""
-    diagnoses: list[Block] = []
-    episodes: list[Block] = []
+    diagnoses, episodes = [], []
     for run in page.runs.drop_duplicates(["env", "label"]).itertuples():
-        path = str(run.run)
-        if not any(Path(path).glob("tests/*")):
-            continue
+        path, title = str(run.run), page.title(run)
         try:
-            if page.found.settings[path].get("model.kind") == "multi-headed":
+            about, found = episode.follow_episode(path)
+            panels = [page.panel(*panel, str(run.env), size=(3.7, 1.9)) for panel in found.items()]
+            episodes.append({"title": title, "panels": panels, "texts": [about] * bool(about)})
+            if about and page.found.settings[path].get("model.kind") == "multi-headed":
                 shown = diagnose.tables(diagnose.diagnose(path))
-                diagnoses += [_table_of(table, page.title(run)) for table in shown]
-            if (found := diagnose.follow_episode(path)) is not None:
-                panels = figures.episode_panels(found).items()
-                panels = [page.panel(*panel, run.env, size=(3.7, 1.9)) for panel in panels]
-                episodes.append(
-                    {"title": page.title(run), "panels": panels, "texts": [found.about]}
-                )
+                diagnoses += [_table_of(table, title) for table in shown]
         except HeadwayError as error:
-            page.found.notes.append((path, f"cannot be gone through again: {error}"))
+            page.found.notes.append((path, f"no diagnosis: {error}"))
     return diagnoses, episodes
 
 
@@ -371,20 +347,19 @@ def _table_of(table: Table, owner: str) -> Block:
 
 def _films(page: Page) -> Block:
     """The newest film of every run, as long as the page has room."""
-    panels, texts, room = [], [], ROOM * 2**20
+    panels, room = [], ROOM * 2**20
     for run in page.runs.itertuples():
         films = [file for file in Path(str(run.run)).iterdir() if file.suffix.lower() in FILMS]
-        if not films:
-            continue
-        newest = max(films, key=lambda file: file.stat().st_mtime)
-        if (size := newest.stat().st_size) > room:
-            texts.append(f"{newest} is left out: films on a page have {ROOM} MiB in all.")
-            continue
-        room -= size
-        content = base64.b64encode(newest.read_bytes()).decode()
-        film = f"data:{FILMS[newest.suffix.lower()]};base64,{content}"
-        panels.append({"title": page.title(run), "film": film})
-    return {"panels": panels, "texts": texts}
+        for newest in sorted(films, key=lambda file: file.stat().st_mtime)[-1:]:
+            if (size := newest.stat().st_size) > room:
+                text = f"{newest.name} is left out: films on a page have {ROOM} MiB in all."
+                page.found.notes.append((str(run.run), text))
+                continue
+            room -= size
+            content = base64.b64encode(newest.read_bytes()).decode()
+            kind = FILMS[newest.suffix.lower()]
+            panels.append({"title": page.title(run), "film": f"data:{kind};base64,{content}"})
+    return {"panels": panels}
 
 
 def _prediction_error(page: Page, env: str) -> Block:
@@ -432,15 +407,11 @@ def _runs(page: Page) -> Block:
 
 
 def _numbers(page: Page) -> Block:
-    table = tables.by_physics(page.found.final)[RAW_COLUMNS].round(4)
+    table = tables.by_physics(page.found.final)[[*RAW, "run"]].round(4)
     lines = []
-    for env, label, *texts, mean, std, score, _ in table.itertuples(index=False):
+    for label, *texts, mean, std, score, _ in table.itertuples(index=False):
         numbers = _number(mean, "{:,.2f}"), _number(std, "{:,.2f}"), _number(score, "{:.3f}")
-        lines.append(page.line(label, env, *map(str, texts), *numbers))
-    columns = [
-        "method", "environment", "seed", "group", "physics", "episodes", "mean return",
-        "standard deviation", "score",
-    ]  # fmt: skip
+        lines.append(page.line(label, *map(str, texts), *numbers))
     csv = table.rename(columns={"label": "method"}).to_csv(index=False)
     link = base64.b64encode(csv.encode()).decode()
-    return {"table": _table(columns, lines, range(6, 9)), "csv": link}
+    return {"table": _table([*RAW.values()], lines, range(6, 9)), "csv": link}

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from rich import box
-from rich.table import Table
+from rich.table import Column, Table
 
 from headway.config import Config, flatten
 from headway.errors import RunError
@@ -72,7 +72,7 @@ class Runs:
     """Rows of `prediction_error.csv` after the newest tested iteration."""
     settings: Mapping[str, Mapping[str, Any]]
     """Settings by dotted name, by run."""
-    notes: Sequence[tuple[str, str]]
+    notes: list[tuple[str, str]]
     """Remarks on runs: path of the run, one line."""
 
     @property
@@ -316,9 +316,8 @@ def by_physics(episodes: pd.DataFrame) -> pd.DataFrame:
 
 def by_group(episodes: pd.DataFrame) -> pd.DataFrame:
     """Summarise test episodes by run and group; every physics of a group counts once."""
-    parts = by_physics(episodes)
+    parts = by_physics(episodes).assign(square=lambda t: t.return_std**2 + t.return_mean**2)
     keys = [*SERIES, "method", "protocol", "group"]
-    parts["square"] = parts.return_std**2 + parts.return_mean**2
     table = parts.groupby(keys, sort=False, as_index=False).agg(
         episodes=("episodes", "sum"),
         return_mean=("return_mean", "mean"),
@@ -337,12 +336,10 @@ def evaluation(
     Returns:
         Returns and scores as plain values for JSON, and laid out for a terminal.
     """
-    episodes = pd.DataFrame([row.to_csv() for row in rows]).assign(
-        score=np.array([score_of(row, config) for row in rows], float),
-        label=config.method,
-        run="",
-        protocol="",
-    )
+    own = {"label": config.method, "run": "", "protocol": ""}
+    episodes = pd.DataFrame(
+        [{**row.to_csv(), **own, "score": score_of(row, config)} for row in rows]
+    ).astype({"score": float})
     names = ["group", "sim_params", "episodes", "return_mean", "return_std", "score"]
     facts: dict[str, list[dict[Any, Any]]] = {
         name: summary.filter(names).to_dict("records")
@@ -364,8 +361,7 @@ def evaluation(
             spread = f" ± {line['return_std']:,.1f}" if line["episodes"] > 1 else ""
             score = "–" if line["score"] is None else f"{line['score']:.2f}"
             cells = [str(line["episodes"]), f"{line['return_mean']:,.1f}{spread}"]
-            style = "bold" if line is group else None
-            table.add_row(name, *cells, *[score] * scored, style=style)
+            table.add_row(name, *cells, *[score] * scored, style="bold" if line is group else None)
         table.add_section()
     table.caption = (
         "return: mean ± standard deviation over episodes; every physics of a group counts once"
@@ -395,9 +391,8 @@ def fitted(run_dir: str | Path) -> tuple[dict[str, Any], Table, Table]:
         shares = own.pivot(index="member", columns="head", values="share")
         physics = parse_sim_params(str(text))
         number = int(physics.pop(RECORDING))
-        about = {"recording": number, "sim_params": physics, **recordings[number]}
         best = {"heads": shares.idxmax(axis=1).tolist(), "share": float(shares.max(axis=1).mean())}
-        found.append(about | best)
+        found.append({"recording": number, "sim_params": physics, **recordings[number], **best})
     found.sort(key=lambda row: (row["heads"], row["recording"]))
     columns = ("recording", "share", "transitions", "pieces")
     title = "Which head of each member explains a recording best"
@@ -417,8 +412,9 @@ def fitted(run_dir: str | Path) -> tuple[dict[str, Any], Table, Table]:
 
 def new_table(title: str, *texts: str, numbers: Sequence[str] = ()) -> Table:
     """An empty table in the look of all others: columns of texts, then columns of numbers."""
-    table = Table(
+    return Table(
         *texts,
+        *(Column(name, justify="right") for name in numbers),
         title=title,
         title_style="bold",
         title_justify="left",
@@ -426,9 +422,6 @@ def new_table(title: str, *texts: str, numbers: Sequence[str] = ()) -> Table:
         caption_justify="left",
         box=box.SIMPLE_HEAD,
     )
-    for name in numbers:
-        table.add_column(name, justify="right")
-    return table
 
 
 def group_label(group: str) -> str:
