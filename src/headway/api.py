@@ -74,7 +74,9 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
         env: Short name or id of an environment; an EnvSpec; or, with a task, any id that Gymnasium
             knows or what makes the environment. Another process must know an EnvSpec, too:
             where a module holds it, it finds it, else `headway.register` tells it.
-        task: The Task of an environment that has no EnvSpec, or its class.
+        task: The Task of an environment that has no EnvSpec, or its class; `headway.Task` itself
+            leaves reward and end of an episode to the model, which learns them, and is the default
+            of what makes an environment.
         sim_params: Physics of that environment, `{"train": {...}, "unseen": {...}}`, and
             instead of those of another.
         method: A name from `headway list methods`.
@@ -103,6 +105,8 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
     prepare_jax()
     if isinstance(sim_params, Mapping):
         sim_params = SimParamSets.from_dict(sim_params)
+    if task is None and callable(env):
+        task = Task
     if task is not None:
         if isinstance(env, EnvSpec) or sim_params is None:
             raise ConfigError(

@@ -106,6 +106,7 @@ class ModelConfig:
     backward_deterministic: bool = False
     deterministic: bool = True
     relation_head: bool = False
+    learned_reward: bool = False
 
 
 @settings
@@ -140,6 +141,9 @@ class MultiHeadedConfig(ModelConfig):
     relation_head: Flag = False
     """A linear layer learns to tell which contexts come from the same trajectory, and
     thereby shapes the context (RIA); wants one head and a `learned` context."""
+    learned_reward: Flag = False
+    """The networks also predict the reward and the end of an episode, and plans count what they
+    predict; always so where the Task has no `reward`."""
 
     def __post_init__(self):
         learned = self.context == "learned" and self.context_size > 0

@@ -49,6 +49,12 @@ class Trajectory:
                 )
 
     @property
+    def outcome(self) -> Float[np.ndarray, "time 2"]:
+        """The reward of each transition, and whether it ended the episode for good."""
+        last = np.arange(len(self)) == len(self) - 1
+        return np.stack([self.reward, last & self.terminated], 1).astype(np.float32)
+
+    @property
     def returns(self) -> float:
         """Undiscounted sum of rewards."""
         return float(np.sum(self.reward, dtype=np.float64))
@@ -124,6 +130,8 @@ class Episodes(eqx.Module):
     count: Int[Array, ""]
     sim_params: Float[Array, "episode sim_param"]
     """The true simulator parameters that a model is told; of width 0 where it is told none."""
+    outcome: Float[Array, "episode time outcome"]
+    """Reward, and 1 where the episode ended for good; of width 0 where neither is learned."""
 
     @classmethod
     def pad(
@@ -132,6 +140,8 @@ class Episodes(eqx.Module):
         capacity: int,
         max_length: int,
         sim_param_names: tuple[str, ...] = (),
+        *,
+        outcomes: bool = False,
     ) -> "Episodes":
         """Lay trajectories out in arrays of fixed shape, repeating the last observation."""
         first = trajectories[0]
@@ -139,15 +149,18 @@ class Episodes(eqx.Module):
         action = np.zeros((capacity, max_length, first.action.shape[1]), np.float32)
         length = np.zeros(capacity, np.int32)
         sim_params = np.zeros((capacity, len(sim_param_names)), np.float32)
+        outcome = np.zeros((capacity, max_length, 2 * outcomes), np.float32)
         for row, trajectory in enumerate(trajectories):
             steps = len(trajectory)
             sim_params[row] = sim_params_row(trajectory.sim_params, sim_param_names)
             obs[row, : steps + 1] = trajectory.obs
             obs[row, steps + 1 :] = trajectory.obs[-1]
             action[row, :steps] = trajectory.action
+            if outcomes:
+                outcome[row, :steps] = trajectory.outcome
             length[row] = steps
         count = jnp.asarray(len(trajectories), jnp.int32)
-        return cls(*map(jnp.asarray, (obs, action, length, count, sim_params)))
+        return cls(*map(jnp.asarray, (obs, action, length, count, sim_params, outcome)))
 
     def history(
         self, episode: Int[Array, "*batch"], step: Int[Array, "*batch"], length: int

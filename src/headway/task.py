@@ -1,6 +1,5 @@
 """Tasks and the table of environments: all that a model and a planner must know of one, in JAX."""
 
-import abc
 import copy
 import dataclasses
 import functools
@@ -35,6 +34,9 @@ HostScaled = Float[np.ndarray, "*batch scaled"]
 
 class Task(eqx.Module):
     """The reward, the end of an episode, and how observations enter and leave a model.
+
+    A Task without `reward`, as this class is, leaves reward and end to the model, which learns them
+    (`model.learned_reward`).
 
     Every method is pure JAX and written for one transition with any number of leading
     axes. `action` is always in the environment's own units, in one row: the number of a category
@@ -79,9 +81,16 @@ class Task(eqx.Module):
         bounds = tuple(self.action_low), tuple(self.action_high)
         return Spaces(self.obs_size, "box", *bounds, (self.action_size,), "float32")
 
-    @abc.abstractmethod
+    @property
+    def has_reward(self) -> bool:
+        """False where the reward is left to the model."""
+        return type(self).reward is not Task.reward
+
     def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """Reward of a transition, equal to what `env.step` returns."""
+        raise ConfigError(
+            f"{type(self).__name__} has no reward, allowed here: one in JAX; write it."
+        )
 
     def released_reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """Reward that the released code plans with; differs where that lags or errs."""
@@ -154,8 +163,9 @@ class EnvSpec:
     env_id: str | Callable[..., Any]
     """Any id that `gymnasium.make` takes, also `"module:Env-v0"`; or what makes the environment,
     a class or a function. It takes the options as keywords and, to be filmed, `render_mode`."""
-    make_task: Callable[..., Task]
-    """Builds the Task; takes those of the options as keywords that it depends on."""
+    make_task: Callable[..., Task] = Task
+    """Builds the Task; takes those of the options as keywords that it depends on. By default
+    reward and end of an episode are learned."""
     sim_params: SimParamSets
     """Physics to train on and to test on; passed to `reset` as `options["sim_params"]`."""
     episode_length: int = 0

@@ -75,6 +75,16 @@ class Dynamics(eqx.Module):
         """State that the rollouts of one environment carry from step to step, [member, size]."""
         return ()
 
+    def outcome(self, carry: Any) -> tuple[Array, Array] | None:
+        """Reward, and whether the episode ended, [member, particle, candidate], of the last step.
+
+        None, the default, where the Task computes them.
+
+        Args:
+            carry: After that step.
+        """
+        return None
+
     @abc.abstractmethod
     def step(
         self,

@@ -218,7 +218,8 @@ def episode_losses(
     row = jnp.full_like(time, episode)
     past = episodes.history(row, time, setup.history_length)
     physics = episodes.sim_params[row]
-    batch = Batch(obs[:-1], action, obs[1:], past, jnp.ones(len(action)), physics)
+    outcome = episodes.outcome[episode]
+    batch = Batch(obs[:-1], action, obs[1:], past, jnp.ones(len(action)), physics, row, outcome)
     members = model.num_members
     batch = jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *x.shape)), batch)
     model = model.in_precision(setup.config.precision)
@@ -245,6 +246,7 @@ def gather_batch(
         weight=weight,
         sim_params=episodes.sim_params[episode],
         trajectory=episode,
+        outcome=episodes.outcome[episode, step],
     )
     if assignment is None:
         return batch, None

@@ -1,7 +1,7 @@
 """Multi-headed networks folded for a plan: all that is fixed while it lasts is in the weights."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -46,6 +46,8 @@ class FoldedDynamics(Dynamics):
     task: Task
     context_layer: int | None = eqx.field(static=True)
     """The hidden layer that the context joins; None if it joins the heads."""
+    outcomes: int = eqx.field(static=True, default=0)
+    """Outputs after the delta: 2 where the reward and the end are learned."""
 
     @property
     def num_members(self) -> int:
@@ -64,13 +66,21 @@ class FoldedDynamics(Dynamics):
         )
         return dataclasses.replace(self, own=own, hidden=hidden)
 
+    def start(self) -> Any:
+        """See `Dynamics.start`: the learned reward and end of the last step, if there are any."""
+        return jnp.zeros((self.num_members, self.outcomes)) if self.outcomes else ()
+
+    def outcome(self, carry: Any) -> Any:
+        """See `Dynamics.outcome`."""
+        return (carry[:, 0], carry[:, 1] > 0) if self.outcomes else None
+
     def step(
         self,
-        carry: tuple[()],
+        carry: Any,
         obs: Float[Array, "member obs particle candidate"],
         action: Float[Array, "member action particle candidate"],
         noise: Float[Array, "member obs particle #candidate"] | None,
-    ) -> tuple[tuple[()], Float[Array, "member obs particle candidate"]]:
+    ) -> tuple[Any, Float[Array, "member obs particle candidate"]]:
         """See `Dynamics.step`: a sample of the next delta, or its mean without noise."""
         heads, low, high, context_bias = self.own
         activation = rough_swish if heads.weight.dtype == jnp.bfloat16 else swish
@@ -80,13 +90,14 @@ class FoldedDynamics(Dynamics):
                 layer = layer._replace(bias=context_bias)  # noqa: PLW2901
             x = activation(layer(x))
         out, obs_size = heads(x), obs.shape[1]
-        delta = out[:, :obs_size]
+        delta, outcome, out = jnp.split(out, (obs_size, obs_size + self.outcomes), axis=1)
         if noise is not None and low is not None and high is not None:
             members, choices, _ = low.shape
-            logvar = out[:, obs_size:].reshape(members, choices, obs_size, *out.shape[2:])
+            logvar = out.reshape(members, choices, obs_size, *out.shape[2:])
             var = bounded_var(logvar, low[..., None, None], high[..., None, None])
             std = jnp.sqrt(var.sum(1)) * (self.delta_std / choices)[:, None, None]
             delta = delta + noise * std
+        carry = outcome if self.outcomes else carry
         return carry, over_rows(self.task.postprocess)(obs, delta)
 
 
@@ -128,19 +139,24 @@ def fold(
     if context_bias is not None and place is not None:
         context_bias = layers[place].bias + context_bias
     # Heads give raw deltas, averaged over the choices, and log-variances of each.
-    delta, low, high = statistics.delta, None, None
+    delta, reward, low, high = statistics.delta, statistics.reward, None, None
+    mean, std, obs_size = delta.mean, delta.std, delta.std.size
+    if reward is not None:  # it comes next, and last the logit of the end, as it is
+        mean = jnp.concatenate([mean, reward.mean, jnp.zeros(1)])
+        std = jnp.concatenate([std, reward.std, jnp.ones(1)])
     weight, bias = _chosen(net.mean_heads, heads, context, correction)
-    weights = [weight.mean(2) * delta.std]
-    biases = [bias.mean(2) * delta.std + delta.mean]
+    weights = [weight.mean(2) * std]
+    biases = [bias.mean(2) * std + mean]
     if net.logvar_heads is not None:
-        weight, bias = _chosen(net.logvar_heads, heads, context)
+        logvar_heads = jax.tree.map(lambda x: x[..., :obs_size], net.logvar_heads)
+        weight, bias = _chosen(logvar_heads, heads, context)
         num_envs, members, _, hidden_size, _ = weight.shape
         weights.append(weight.transpose(0, 1, 3, 2, 4).reshape(num_envs, members, hidden_size, -1))
         biases.append(bias.reshape(num_envs, members, -1))
-        low, high = net.min_logvar[heads], net.max_logvar[heads]
+        low, high = (x[heads, :obs_size] for x in (net.min_logvar, net.max_logvar))
     weight = jnp.concatenate(weights, axis=-1).mT.astype(PRECISIONS[precision])
     own = OwnHeads(Layer(weight, jnp.concatenate(biases, axis=-1)), low, high, context_bias)
-    return FoldedDynamics(own, layers, delta.std, task, place)
+    return FoldedDynamics(own, layers, delta.std, task, place, std.size - obs_size)
 
 
 def _chosen(
@@ -154,7 +170,9 @@ def _chosen(
     weight, bias = layer.weight[member, heads], layer.bias[member, heads]
     if correction is not None:
         env = jnp.arange(len(heads))[:, None, None]
-        chosen = correction[env, member, heads]
+        chosen = correction[env, member, heads]  # of the delta only
+        rest = weight.shape[-1] - chosen.shape[-1]
+        chosen = jnp.pad(chosen, [(0, 0)] * (chosen.ndim - 1) + [(0, rest)])
         weight, bias = weight + chosen[..., :-1, :], bias + chosen[..., -1, :]
     if context is None:
         return weight, bias

@@ -5,6 +5,7 @@ Everything is per member: heads compete within a member, never across members.
 
 from typing import Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -12,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from headway.config import FittingConfig
 from headway.data import History
 from headway.models.multi_headed import MultiHeadNet
-from headway.models.networks import ContextEncoder, GaussianNet, Prediction
+from headway.models.networks import ContextEncoder, GaussianNet, Prediction, softplus
 from headway.models.statistics import Statistics, network_input
 from headway.task import Task
 
@@ -33,6 +34,8 @@ class Batch(NamedTuple):
     """The true simulator parameters, for a model that is told them."""
     trajectory: Int[Array, "member sample"] | None = None
     """Row of the trajectory that each sample comes from."""
+    outcome: Float[Array, "member sample outcome"] | None = None
+    """Reward, and 1 where the episode ended for good, for a model that learns them."""
 
 
 class HeadLosses(NamedTuple):
@@ -70,20 +73,32 @@ def negative_log_likelihood(
 def head_losses(
     model: MultiHeadNet, task: Task, statistics: Statistics, batch: Batch
 ) -> HeadLosses:
-    """Loss of every head on every sample, with the context of the sample's history."""
+    """Loss of every head on every sample, with the context of the sample's history.
+
+    A learned reward is one more dimension of what is predicted; to it comes the cross-entropy of
+    the end of the episode.
+    """
     context = model.context(batch.history, statistics, batch.sim_params)
 
-    def losses(net: GaussianNet, start, end, delta) -> Float[Array, "member head sample"]:
+    def predicted(net: GaussianNet, start) -> Prediction:
         x = network_input(task, statistics, start, batch.action)
-        target = delta.normalize(task.target(start, end)).mT
-        prediction = net(x.mT, None if context is None else context.mT)
-        return negative_log_likelihood(prediction, target[:, None], axis=-2)
+        return net(x.mT, None if context is None else context.mT)
 
-    forward = losses(model.forward_net, batch.obs, batch.next_obs, statistics.delta)
+    forward = predicted(model.forward_net, batch.obs)
+    target = statistics.delta.normalize(task.target(batch.obs, batch.next_obs))
+    ends = jnp.zeros(())
+    if statistics.reward is not None and batch.outcome is not None:
+        logit, ended = forward.mean[:, :, -1], batch.outcome[:, None, :, 1]
+        ends = softplus(logit) - ended * logit
+        forward = jax.tree.map(lambda x: x[:, :, :-1], forward)
+        reward = statistics.reward.normalize(batch.outcome[..., :1])
+        target = jnp.concatenate([target, reward], axis=-1)
+    loss = negative_log_likelihood(forward, target.mT[:, None], axis=-2) + ends
     if model.backward_net is None:
-        return HeadLosses(forward, None)
-    backward = losses(model.backward_net, batch.next_obs, batch.obs, statistics.backward_delta)
-    return HeadLosses(forward, backward)
+        return HeadLosses(loss, None)
+    backward = predicted(model.backward_net, batch.next_obs)
+    target = statistics.backward_delta.normalize(task.target(batch.next_obs, batch.obs))
+    return HeadLosses(loss, negative_log_likelihood(backward, target.mT[:, None], axis=-2))
 
 
 def assign_heads(losses: Float[Array, "*batch head segment"]) -> Int[Array, "*batch segment"]:

@@ -5,6 +5,7 @@ T-MCL, and all that its settings express. Which head plans is equation 3 of the 
 """
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -68,14 +69,13 @@ class MultiHeadNet(eqx.Module):
             "sim-params": len(sim_param_names),
         }[config.context]
 
-        def gaussian_net(key: PRNGKeyArray, *, deterministic: bool) -> GaussianNet:
-            return GaussianNet.init(config, task, width, deterministic=deterministic, key=key)
-
-        forward = gaussian_net(forward_key, deterministic=config.deterministic)
+        draw = functools.partial(GaussianNet.init, config, task, width)
+        outcomes = 2 * config.learned_reward
+        forward = draw(deterministic=config.deterministic, outcomes=outcomes, key=forward_key)
         backward = encoder = relation = None
         if config.backward_net:
             deterministic = config.deterministic or config.backward_deterministic
-            backward = gaussian_net(backward_key, deterministic=deterministic)
+            backward = draw(deterministic=deterministic, key=backward_key)
         if config.context == "learned" and width:
             encoder = ContextEncoder.init(config, history_size, key=context_key)
         if config.relation_head:
@@ -153,8 +153,11 @@ class MultiHeadNet(eqx.Module):
         x = network_input(task, statistics, obs, action).mT
         x = jnp.broadcast_to(x, (self.num_members, *x.shape))
         features = self.forward_net.head_input(x, None if context is None else context.mT)
-        mean, logvar = self.forward_net.predict(features)
-        residual = statistics.delta.normalize(task.target(obs, next_obs)).mT - mean
+        delta = statistics.delta.normalize(task.target(obs, next_obs)).mT
+        mean, logvar = jax.tree.map(
+            lambda x: x[:, :, : len(delta)], self.forward_net.predict(features)
+        )
+        residual = delta - mean
         features = jnp.concatenate([features, jnp.ones_like(features[:, :1])], axis=1)
         return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), Residuals(features, residual, logvar))
 

@@ -155,10 +155,13 @@ def softplus(x: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 class Prediction(NamedTuple):
-    """Gaussian over the normalised `delta`; `logvar` is None in deterministic mode."""
+    """Gaussian over the normalised `delta`; `logvar` is None in deterministic mode.
 
-    mean: Float[Array, "member head obs batch"]
-    logvar: Float[Array, "member head obs batch"] | None
+    Where the reward is learned, it comes after the delta, and the logit of the end is last.
+    """
+
+    mean: Float[Array, "member head out batch"]
+    logvar: Float[Array, "member head out batch"] | None
 
 
 class GaussianNet(eqx.Module):
@@ -170,8 +173,8 @@ class GaussianNet(eqx.Module):
     hidden: tuple[Dense, ...]
     mean_heads: Dense
     logvar_heads: Dense | None
-    max_logvar: Float[Array, "head obs"] | None
-    min_logvar: Float[Array, "head obs"] | None
+    max_logvar: Float[Array, "head out"] | None
+    min_logvar: Float[Array, "head out"] | None
     context_layer: int | None = eqx.field(static=True, default=None)
     """The hidden layer that takes the context beside its input; None if the heads do."""
 
@@ -183,6 +186,7 @@ class GaussianNet(eqx.Module):
         context_size: int,
         *,
         deterministic: bool,
+        outcomes: int = 0,
         key: PRNGKeyArray,
     ) -> "GaussianNet":
         """Draw the weights of one network per member.
@@ -192,9 +196,11 @@ class GaussianNet(eqx.Module):
             task: The sizes of observations and actions.
             context_size: Width of the context.
             deterministic: Heads predict a mean only.
+            outcomes: Outputs beside the delta: 2 for the reward and the logit of the end, or 0.
             key: Draws the weights.
         """
         members, heads = config.num_members, config.num_heads
+        out_size = task.obs_size + outcomes
         outs = config.hidden_sizes
         ins = [task.feature_size + task.action_size, *outs]
         place = {"input": 0, "last-hidden": len(outs) - 1, "head": None}[config.context_at]
@@ -204,11 +210,11 @@ class GaussianNet(eqx.Module):
             Dense.init((members,), n, m, key=k)
             for n, m, k in zip(ins[:-1], outs, hidden_keys, strict=True)
         )
-        mean_heads = Dense.init((members, heads), ins[-1], task.obs_size, key=mean_key)
+        mean_heads = Dense.init((members, heads), ins[-1], out_size, key=mean_key)
         if deterministic:
             return cls(hidden, mean_heads, None, None, None, place)
-        logvar_heads = Dense.init((members, heads), ins[-1], task.obs_size, key=logvar_key)
-        high, low = (jnp.full((heads, task.obs_size), b, jnp.float32) for b in (0.5, -10.0))
+        logvar_heads = Dense.init((members, heads), ins[-1], out_size, key=logvar_key)
+        high, low = (jnp.full((heads, out_size), b, jnp.float32) for b in (0.5, -10.0))
         return cls(hidden, mean_heads, logvar_heads, high, low, place)
 
     def __call__(

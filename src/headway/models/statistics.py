@@ -62,10 +62,17 @@ class Statistics(eqx.Module):
     history_action: Normalizer
     sim_params: Normalizer | None = None
     """Only for a model that takes the true simulator parameters."""
+    reward: Normalizer | None = None
+    """Only for a model that learns the reward."""
 
     @classmethod
     def identity(
-        cls, task: Task, history_length: int, sim_param_names: tuple[str, ...] = ()
+        cls,
+        task: Task,
+        history_length: int,
+        sim_param_names: tuple[str, ...] = (),
+        *,
+        learned_reward: bool = False,
     ) -> "Statistics":
         """Statistics before any data: nothing is scaled."""
         return cls(
@@ -75,6 +82,7 @@ class Statistics(eqx.Module):
             Normalizer.identity(task.obs_size),
             Normalizer.identity(history_length, task.action_size),
             Normalizer.identity(len(sim_param_names)) if sim_param_names else None,
+            Normalizer.identity(1) if learned_reward else None,
         )
 
     @classmethod
@@ -84,6 +92,8 @@ class Statistics(eqx.Module):
         trajectories: list[Trajectory],
         history_length: int,
         sim_param_names: tuple[str, ...] = (),
+        *,
+        learned_reward: bool = False,
     ) -> "Statistics":
         """Recompute from all data so far, as at the start of every iteration.
 
@@ -94,6 +104,7 @@ class Statistics(eqx.Module):
             trajectories: All data.
             history_length: Past transitions that a context is made of (K).
             sim_param_names: Simulator parameters that the model is told.
+            learned_reward: The model learns the reward.
         """
         obs = jnp.asarray(np.concatenate([t.obs[:-1] for t in trajectories]))
         next_obs = jnp.asarray(np.concatenate([t.obs[1:] for t in trajectories]))
@@ -108,6 +119,9 @@ class Statistics(eqx.Module):
             Normalizer.fit(np.asarray(task.target(next_obs, obs))),
             Normalizer.of_moments(*history_action_moments(trajectories, history_length)),
             told,
+            Normalizer.fit(np.concatenate([t.outcome for t in trajectories])[:, :1])
+            if learned_reward
+            else None,
         )
 
 

@@ -38,7 +38,7 @@ def candidate_returns(
 
     Args:
         dynamics: The model, specialised to its belief.
-        task: Reward and termination.
+        task: Reward and termination, unless the dynamics has learned them.
         obs: Where each environment is now.
         candidates: Action sequences in [-1, 1].
         planner: Particles, their noise, and the reward that counts.
@@ -149,8 +149,10 @@ def rollout_returns(
         action = jnp.broadcast_to(action[:, :, None], (rows[0], action.shape[1], *rows[1:]))
         state, next_obs = dynamics.step(state, obs, action, draw(noise) if draw else noise)
         action = scale(action)
-        paid = paid + jnp.where(alive, pays(obs, action, next_obs), 0.0)
-        alive = alive & ~ends(obs, action, next_obs)
+        learned = dynamics.outcome(state)
+        now, over = learned or (pays(obs, action, next_obs), jnp.zeros(rows, bool))
+        paid = paid + jnp.where(alive, now, 0.0)
+        alive = alive & ~(over | ends(obs, action, next_obs))
         return (state, next_obs, alive, paid), None
 
     begin = jax.tree.map(wide, dynamics.start()), wide(obs), jnp.ones(rows, bool), jnp.zeros(rows)

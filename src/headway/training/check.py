@@ -137,6 +137,10 @@ def method_findings(task: Task) -> Iterator[Finding]:
         ("target", row, obs, next_obs),
         ("postprocess", row, obs, next_obs),
     ):
+        if name == "reward" and not task.has_reward:
+            text = "There is none: the model learns reward and end from the environment's."
+            yield Finding("Task.reward", "remark", text)
+            continue
         yield _finding(f"Task.{name}", _traced(task, name, shape, rows))
 
 
@@ -291,7 +295,8 @@ def compared(task: Task, taken: list[Trajectory]) -> Iterator[Finding]:
     @jax.jit
     def numbers(obs, action, next_obs):
         rows, back = (obs, action, next_obs), task.postprocess(obs, task.target(obs, next_obs))
-        return task.reward(*rows), task.terminated(*rows), back, task.preprocess(obs)
+        reward = task.reward(*rows) if task.has_reward else obs[:, 0]
+        return reward, task.terminated(*rows), back, task.preprocess(obs)
 
     reward, ends, back, features = map(np.asarray, numbers(obs, action, next_obs))
     # What the last bit of an observation decides is nobody's fault.
@@ -307,6 +312,8 @@ def compared(task: Task, taken: list[Trajectory]) -> Iterator[Finding]:
         ("preprocess", 2.0 * ~finite, features, len(obs) * ["finite"]),
         ("postprocess", (np.abs(back - next_obs) / scale).max(1), back, next_obs),
     ):
+        if not task.has_reward and name in ("reward", "terminated"):
+            continue
         bad, row = ~(error <= 1), np.argmax(np.nan_to_num(error, nan=np.inf))  # NaN is bad
         text = f"Task.{name} is {_short(mine[row])}, allowed: {_short(theirs[row])} as in the"
         text += f" environment; so in {bad.sum()} of {len(obs)} transitions, worst at obs"

@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from headway.config import TOLERANCE, Config, known_settings, override
+from headway.config import BUILT_IN_KINDS, TOLERANCE, Config, known_settings, override
 from headway.errors import ConfigError, unknown_name
 from headway.task import (
     BUILT_IN,
@@ -17,6 +17,7 @@ from headway.task import (
     env_spec,
     episode_length,
     sim_param_sets,
+    task_of,
 )
 
 Settings = Mapping[str, Any]
@@ -313,6 +314,13 @@ def make_config(
     config = override(config, {**chosen.settings, **chosen.by_preset.get(preset, {})})
     config = override(config, {"seed": seed, **(settings or {})})
     env_options(config)  # refuses unknown ones
+    if config.model.learns and not task_of(config).has_reward:
+        if config.model.kind in BUILT_IN_KINDS[1:]:
+            raise ConfigError(
+                f"the Task of {config.env} has no reward, and {method} learns none, allowed: a"
+                " method with a multi-headed model, as tmcl; or write the reward."
+            )
+        config = override(config, {"model.learned_reward": True})
     if not episode_length(config):
         config = override(config, {"collection.episode_length": _time_limit(spec)})
     return config

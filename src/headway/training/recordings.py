@@ -329,8 +329,10 @@ def _pieces(
 ) -> list[Trajectory]:
     """Cut rows into trajectories without a gap; rewards that are missing are the Task's."""
     obs = jnp.asarray(rows.obs)
-    own = task.reward(obs[:-1], task.scale_action(jnp.asarray(rows.action[:-1])), obs[1:])
-    reward = np.where(np.isnan(rows.reward[:-1]), own, rows.reward[:-1])
+    reward, unknown = rows.reward[:-1], np.isnan(rows.reward[:-1])
+    if unknown.any():
+        action = task.scale_action(jnp.asarray(rows.action[:-1]))
+        reward = np.where(unknown, task.reward(obs[:-1], action, obs[1:]), reward)
     pieces = []
     cuts = np.flatnonzero(np.diff(rows.valid) | (np.diff(rows.number) != 0)) + 1
     for run in np.split(np.arange(len(obs)), cuts):

@@ -175,10 +175,12 @@ class Fitted(Trainer):
         super().__init__(config, environments)
         self.history_length, self.names = config.model.history_length, told_sim_params(config)
         self.setup = FitSetup(self.task, config.fitting, self.history_length)
+        self.learned_reward = config.model.learned_reward
 
     def begin_with(self, net: Any) -> TrainState:
         """A drawn network, with normalisers that change nothing yet."""
-        identity = Statistics.identity(self.task, self.history_length, self.names)
+        sizes = self.task, self.history_length, self.names
+        identity = Statistics.identity(*sizes, learned_reward=self.learned_reward)
         return TrainState(FitState.new(net), identity)
 
     def pad(self, trajectories: list[Trajectory]) -> Episodes:
@@ -193,7 +195,11 @@ class Fitted(Trainer):
             longest = max(map(len, trajectories))
             length = min(length, max(64, 2 ** (longest - 1).bit_length()))
             capacity = max(capacity, 2 ** (len(trajectories) - 1).bit_length())
-        return Episodes.pad(trajectories, capacity, length, self.names)
+        return self._padded(trajectories, capacity, length)
+
+    def _padded(self, trajectories: list[Trajectory], capacity: int, length: int) -> Episodes:
+        sizes = capacity, length, self.names
+        return Episodes.pad(trajectories, *sizes, outcomes=self.learned_reward)
 
     def epoch(self, iteration: int, key: PRNGKeyArray) -> tuple[Callable, Any, Any]:
         """A pass over the data, and the keys of bootstrap samples and of shuffles.
@@ -210,7 +216,8 @@ class Fitted(Trainer):
         # A round begins while steps are too few, so it may bring as many as it can once more.
         most = collection.num_episodes * episode_length(self.config) + collection.min_steps
         most = max(collection.num_iterations * most, sum(map(len, trajectories)))
-        statistics = Statistics.fit(self.task, trajectories, self.history_length, self.names)
+        known = self.task, trajectories, self.history_length, self.names
+        statistics = Statistics.fit(*known, learned_reward=self.learned_reward)
         samples = Samples.table(
             [len(trajectory) for trajectory in trajectories],
             fitting.future_length,
@@ -265,7 +272,7 @@ class MultiHeadedTrainer(Fitted):
     ) -> Iterable[Float[np.ndarray, "member head time"]]:
         """See `Trainer.head_losses`; one trajectory at a time."""
         for trajectory in trajectories:
-            episode = Episodes.pad([trajectory], 1, episode_length(self.config), self.names)
+            episode = self._padded([trajectory], 1, episode_length(self.config))
             losses = episode_losses(state.fit.model, self.setup, episode, 0, state.statistics)
             yield np.asarray(losses.forward)[..., : len(trajectory)]
 
