@@ -27,13 +27,13 @@ def run(tmp_path, capsys):
 def test_reproduce_on_the_command_line(training, run):
     code, out, _ = run("reproduce", "fig13", "--seeds", "0:2")
     assert code == 0
-    assert re.search(r"T-MCL +2 +41.5 ± 0.7 +– +141.5 ± 0.7", out)
+    assert re.search(r"tmcl +2 +41.5 ± 0.7 +– +141.5 ± 0.7", out)
     assert "headway reproduce fig13 --seeds 0:2 --envs pendulum --preset smoke" in out
     code, out, _ = run("reproduce", "fig13", "--seeds", "0:2", "--json")
     facts = json.loads(out)
     assert (code, facts["runs"], facts["failures"], len(facts["files"])) == (0, 4, {}, 4)
     assert {(p["arm"], p["seed"], p["value"]) for p in facts["returns"]} == {
-        ("MCL", 0, 31.0), ("MCL", 1, 32.0), ("T-MCL", 0, 41.0), ("T-MCL", 1, 42.0)
+        ("mcl", 0, 31.0), ("mcl", 1, 32.0), ("tmcl", 0, 41.0), ("tmcl", 1, 42.0)
     }  # fmt: skip
     assert len(training.calls) == 4
 
@@ -43,7 +43,7 @@ def test_a_failed_run_is_told_on_stderr_with_exit_code_1(training, run):
     code, out, err = run("reproduce", "fig13", "--seeds", "0")
     assert code == 1
     assert "seed0: no finite number" in err
-    assert "T-MCL" in out
+    assert "tmcl" in out
 
 
 def test_dry_run_lists_and_runs_nothing(training, run, tmp_path):
@@ -66,8 +66,8 @@ def test_sweep_on_the_command_line(run, tmp_path):
     )  # fmt: skip
     assert code == 0
     assert [point["arm"] for point in json.loads(out)["returns"]] == [
-        "PETS, planner.horizon 3", "PETS, planner.horizon 5",
-        "T-MCL, planner.horizon 3", "T-MCL, planner.horizon 5",
+        "pets, planner.horizon 3", "pets, planner.horizon 5",
+        "tmcl, planner.horizon 3", "tmcl, planner.horizon 5",
     ]  # fmt: skip
     assert "smoke`, fitting.epochs 1, seeds 5" in (tmp_path / "mine-smoke/mine.md").read_text()
     settings = [RunDir(path).config() for path in tmp_path.glob("runs/pendulum/*/seed5")]
@@ -86,7 +86,7 @@ def test_a_real_run_through_the_command_line(run):
     code, out, _ = run(*words)
     assert code == 0
     (point,) = json.loads(out)["returns"]
-    assert point["arm"] == "Random"
+    assert point["arm"] == "random"
     assert -2000 < point["value"] < 0
     assert run(*words)[1] == out
 

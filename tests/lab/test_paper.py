@@ -49,15 +49,15 @@ def test_figures_share_the_runs_that_they_have_in_common(tmp_path):
     shared = {
         path("fig11", "adaptive"),
         path("fig12", "with context"),
-        path("fig13", "T-MCL"),
+        path("fig13", "tmcl"),
         path("fig14", "H = 3"),
         path("fig15", "M = 10"),
         path("fig16", "N = 10"),
-        path("comparison", "T-MCL"),
+        path("comparison", "tmcl"),
     }
     assert len(shared) == 1
-    assert path("fig13", "MCL") == path("fig15", "M = 1") == path("oracle", "transition-wise")
-    assert path("fig13", "MCL") not in shared
+    assert path("fig13", "mcl") == path("fig15", "M = 1")
+    assert path("fig13", "mcl") not in shared
 
 
 def test_a_sweep_has_an_arm_per_method_and_combination():
@@ -65,7 +65,7 @@ def test_a_sweep_has_an_arm_per_method_and_combination():
     arms = sweep_experiment("mine", ["tmcl", "pets"], grid).arms
     chosen = {"planner.horizon": 10, "fitting.epochs": 1}
     assert len(arms) == 4
-    assert arms[3] == Arm("PETS, planner.horizon 10, fitting.epochs 1", "pets", chosen)
+    assert arms[3] == Arm("pets, planner.horizon 10, fitting.epochs 1", "pets", chosen)
 
 
 def test_what_is_unknown_or_asked_twice_is_refused():

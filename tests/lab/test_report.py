@@ -19,7 +19,7 @@ from headway.lab.report import write_report
 
 CHAPTERS = [
     "results", "learning-curves", "physics", "improvement", "head-shares", "prediction-error",
-    "settings", "times", "runs", "numbers",
+    "settings", "runs", "numbers",
 ]  # fmt: skip
 HOSTILE = '<script>alert("1")</script>&amp;$x_{2}$'
 
@@ -87,7 +87,7 @@ def test_a_trained_run_has_its_film_diagnosis_and_episode(reference, tmp_path, m
     page = report(tmp_path / "runs").read_text()
     assert re.findall(r'<section id="([\w-]+)">', page) == [
         "results", "films", "learning-curves", "physics", "head-shares", "diagnosis", "episode",
-        "times", "runs", "numbers",
+        "runs", "numbers",
     ]  # fmt: skip
     assert re.findall(r'src="([^"]*)"', page) == ["data:video/mp4;base64,bmV3Lm1wNA=="]
     said = text_of(section(page, "diagnosis"))

@@ -6,7 +6,6 @@ Writes a figure (PNG, SVG), every episode's return (CSV) and a table with what c
 
 import dataclasses
 import functools
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -153,14 +152,8 @@ def draw(found: Found) -> list[Path]:
     if not has_curves:
         marks = (
             "Dots are seeds after the last iteration, bars their mean, lines its 95 % interval"
-            " from three seeds on. Scores, where known: 0 is random, 1 the paper's planner on the"
-            " true dynamics."
+            " from three seeds on."
         )
-        if figures.are_methods(arms):  # from the best to the worst, by mean rank
-            means = last.pivot_table(index="arm", columns="env", values="value").fillna(-math.inf)
-            ranks = means.rank(ascending=False).mean(axis=1)
-            order = sorted(looks, key=lambda arm: ranks.get(arm, math.inf))
-            looks = {arm: looks[arm] for arm in order}
     columns = 2 if len(envs) == 4 else min(len(envs), 3)
     lines = -(-len(envs) // columns)
     height = 2.6 if has_curves else 0.9 + 0.32 * len(arms)
@@ -184,9 +177,8 @@ def draw(found: Found) -> list[Path]:
                 figures.curves(axes, points[points.env == env].assign(finished=True), looks)
                 axes.set_ylabel(f"return per episode,\n{measure}" if axes in panels[:, 0] else "")
             else:
-                scores = {arm: cells[-1] for arm, *cells in table(found, env)}
                 values = last[last.env == env].rename(columns={"arm": "label"})
-                figures.dots(axes, values, looks, f"return per episode, {measure}", scores)
+                figures.dots(axes, values, looks, f"return per episode, {measure}")
             if len(comparison.envs) > 1:
                 axes.set_title(env)
     return [path, path.with_suffix(".svg")]

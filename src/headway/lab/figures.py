@@ -141,28 +141,23 @@ def look(index: int) -> dict[str, Any]:
     }
 
 
-def are_methods(arms: Sequence[Any]) -> bool:
-    """Tell whether every arm is another method, and not a setting of one."""
-    return len({arm.method for arm in arms}) == len(arms)
-
-
 def arm_looks(arms: Sequence[Any]) -> dict[str, dict[str, Any]]:
     """Looks of an experiment's arms; where arms are methods, a method has one look everywhere."""
     main = ("tmcl", "mcl", "pets", "mh-pets", "pets-cadm", "grbal", "rebal", "ria")
     order = list(dict.fromkeys((*main, *METHODS)))
-    methods = are_methods(arms)
+    methods = len({arm.method for arm in arms}) == len(arms)
     return {
         arm.label: look(order.index(arm.method) if methods else i) for i, arm in enumerate(arms)
     }
 
 
 def group_looks(groups: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Looks of groups of physics: blue for training, warm and green ones for unseen groups."""
+    """Looks of groups of physics by their labels: blue for training, others for unseen ones."""
     unseen = [group for group in groups if group not in (TRAIN, COLLECTED)]
     looks = {group: look(1 + i) for i, group in enumerate(unseen)}
     looks[TRAIN] = {**look(0), "linestyle": "--", "markerfacecolor": "white"}
     looks[COLLECTED] = look(0)
-    return {group: looks[group] for group in groups}
+    return {group_label(group): looks[group] for group in groups}
 
 
 def numbers(axes: Axes, *, x: str = "", y: str = "") -> None:
@@ -219,9 +214,7 @@ def curves(axes: Axes, table: pd.DataFrame, looks: Looks) -> None:
     numbers(axes, x="environment steps collected", y="return per episode")
 
 
-def dots(
-    axes: Axes, table: pd.DataFrame, looks: Looks, name: str, notes: Mapping[str, str] | None = None
-) -> None:
+def dots(axes: Axes, table: pd.DataFrame, looks: Looks, name: str) -> None:
     """Draw a line per label: a dot per run, a bar at their mean, its 95 % interval.
 
     Args:
@@ -229,7 +222,6 @@ def dots(
         table: label, value.
         looks: Looks by label, from top to bottom.
         name: What the values are.
-        notes: A text beside each line.
     """
     place = axes.get_yaxis_transform()
     for row, (label, style) in enumerate(looks.items()):
@@ -244,9 +236,6 @@ def dots(
         axes.plot(values, [row] * len(values), "o", alpha=0.6, markersize=5, **shared)
         bar = {**shared, "color": INK, "linewidth": 1.6}
         axes.plot([values.mean()] * 2, [row - 0.3, row + 0.3], **bar)
-        axes.text(1.02, row, (notes or {}).get(label, ""), va="center_baseline", transform=place)
-    if notes and set(notes.values()) != {"–"}:
-        axes.text(1.02, -0.75, "score", va="center", color=FAINT, transform=place)
     axes.set_yticks(range(len(looks)), [textwrap.shorten(label, 34) for label in looks])
     axes.set_ylim(len(looks) - 0.5, -0.5)
     axes.tick_params(axis="y", length=0)
@@ -255,35 +244,28 @@ def dots(
     numbers(axes, x=name)
 
 
-def by_physics(
-    axes: Axes, table: pd.DataFrame, looks: Looks, name: str, *, joined: bool = False
-) -> None:
-    """Draw values over physics in ascending order; unseen ones stand on a grey ground.
+def by_physics(axes: Axes, table: pd.DataFrame, looks: Looks, name: str) -> None:
+    """Draw values over physics in ascending order, and lines through the means of each label.
+
+    Unseen physics stand on a grey ground.
 
     Args:
         axes: Where to draw.
         table: label, group, sim_params, value.
         looks: Looks by label.
         name: What the values are.
-        joined: Draw a line through the means of each label instead of every value.
     """
     by_text = {text: parse_sim_params(text) for text in table.sim_params.unique()}
     physics = tables.distinct(by_text.values())
     places = table.sim_params.map({text: physics.index(p) for text, p in by_text.items()})
     for place in places[table.group != TRAIN].unique():
         axes.axvspan(place - 0.5, place + 0.5, color=GROUND, zorder=0, linewidth=0)
-    rng = np.random.default_rng(0)
     for label, style in looks.items():
         own = table.label == label
-        x, y = places[own].to_numpy(), table.value[own].to_numpy()
-        means = pd.Series(y).groupby(x).mean()
-        if joined:
-            axes.plot(means.index, means, **{"markersize": 4.5, **style})
-            continue
-        axes.scatter(x + rng.uniform(-0.13, 0.13, len(x)), y, s=18, color=style["color"],
-                     alpha=0.55, linewidths=0)  # fmt: skip
-        for place, mean in zip(means.index.to_numpy(float), means, strict=True):
-            axes.plot([place - 0.3, place + 0.3], [mean] * 2, color=style["color"], linewidth=2.6)
+        means = table.value[own].groupby(places[own]).mean()
+        dots = {"s": 12, "color": style["color"], "alpha": 0.5, "linewidths": 0}
+        axes.scatter(places[own], table.value[own], **dots, gid=style.get("gid"))
+        axes.plot(means, **{"markersize": 4.5, **style})
     names = tables.varying(physics)
     axes.set_xlim(-0.5, len(physics) - 0.5)
     numbers(axes, y=name)
@@ -344,19 +326,6 @@ def head_shares(axes: Axes, table: pd.DataFrame) -> None:
     axes.set_ylabel(tables.axis_label(names))
 
 
-def _learning_curve(axes: Axes, table: pd.DataFrame, looks: Looks) -> None:
-    """Draw one run's mean return by group, with one standard deviation over episodes."""
-    for group, own in table.groupby("group", sort=False):
-        style = {"markersize": 4, "elinewidth": 1, **looks[str(group)]}
-        middle, spread = own["return"], own["std"]
-        if group == COLLECTED:
-            _band(axes, own.timesteps, middle - spread, middle + spread, style)
-            spread = None
-        axes.errorbar(own.timesteps, middle, yerr=spread, **style)
-    axes.set_xlim(left=0)
-    numbers(axes, x="environment steps collected", y="return per episode (sum of rewards)")
-
-
 def save_run_figures(run_dir: str | Path) -> list[Path]:
     """Draw every figure that the files of a run allow, from these alone.
 
@@ -378,38 +347,25 @@ def save_run_figures(run_dir: str | Path) -> list[Path]:
         text = f"{run.env}, {run.method}, preset {run.preset}, seed {run.seed}{caption}"
         return figure(made[-1], title=title, caption=text, size=size, looks=looks)
 
-    def named(looks: Looks, **more: Any) -> Looks:
-        return {group_label(group): {**style, **more} for group, style in looks.items()}
+    def labelled(table: pd.DataFrame) -> pd.DataFrame:
+        return table.assign(label=table.group.map(group_label))
 
     last = found.episodes[found.episodes.iteration == found.episodes.iteration.max()]
-    tested = f"{len(last)} test episodes"
-    learned = found.curves[found.curves.timesteps > 0]
+    learned = labelled(found.curves[found.curves.timesteps > 0])
     if len(learned):
-        caption = (
-            f". Mean over episodes, band and bars ± 1 standard deviation over episodes; {tested}."
-            " The first iteration acts at random; tests follow the fit."
-        )
+        caption = ". Means over episodes. The first iteration acts at random; tests follow the fit."
         title, looks = "Return while learning", group_looks(learned.group.unique())
-        with frame("learning_curve", title, caption, (6.6, 3.3), named(looks)) as drawing:
-            _learning_curve(drawing.subplots(), learned, looks)
+        with frame("learning_curve", title, caption, (6.6, 3.3), looks) as drawing:
+            curves(drawing.subplots(), learned.assign(finished=True), looks)
     if len(last):
-        panels = {"return per episode": last["return"]}
-        if last.score.notna().any():
-            panels["score (0 random, 1 true dynamics)"] = last.score
         caption = (
-            f", iteration {last.iteration.max() + 1}. Dots are episodes, bars means; {tested}."
+            f", iteration {last.iteration.max() + 1}. Dots are {len(last)} test episodes, lines"
+            " their means."
         )
-        title, size = "Return on training and unseen physics", (4.0 + 2.6 * len(panels), 3.1)
-        looks = group_looks(last.group.unique())
-        with frame(
-            "evaluation", title, caption, size, named(looks, linestyle="", marker="o")
-        ) as drawing:
-            for i, (name, values) in enumerate(panels.items()):
-                axes = drawing.add_subplot(1, len(panels), i + 1)
-                shown = last.assign(label=last.group, value=values).dropna(subset="value")
-                by_physics(axes, shown, looks, name)
-                for level in (0.0, 1.0) if i else ():
-                    axes.axhline(level, color=FAINT, linewidth=1, linestyle=":")
+        title, looks = "Return on training and unseen physics", group_looks(last.group.unique())
+        with frame("evaluation", title, caption, (6.6, 3.1), looks) as drawing:
+            shown = labelled(last).assign(value=last["return"])
+            by_physics(drawing.subplots(), shown, looks, "return per episode")
     shares = found.assignments
     if shares["head"].nunique() > 1:
         caption = (
@@ -435,8 +391,8 @@ def save_run_figures(run_dir: str | Path) -> list[Path]:
             " dimension's standard deviation. At 1, predicting the mean would do as well."
         )
         title, looks = "Prediction error by imagined step", group_looks(found.errors.group.unique())
-        with frame("prediction_error", title, caption, (6.6, 3.1), named(looks)) as drawing:
-            error_lines(drawing.subplots(), found.errors.assign(label=found.errors.group), looks)
+        with frame("prediction_error", title, caption, (6.6, 3.1), looks) as drawing:
+            error_lines(drawing.subplots(), labelled(found.errors), looks)
     about, panels = episode.follow_episode(run_dir)
     if panels:
         title, size = "Predicted and real over time", (7.6, 1.05 * len(panels) + 0.4)

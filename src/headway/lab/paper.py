@@ -28,7 +28,7 @@ class Arm:
     """One of the things that an experiment compares."""
 
     label: str
-    """As it stands in figures and tables."""
+    """As it stands in figures and tables; where arms are methods, their names."""
     method: str = "tmcl"
     """A name of the table of methods."""
     settings: Settings = dataclasses.field(default_factory=dict)
@@ -56,25 +56,7 @@ class Experiment:
         return next((arm for arm in self.arms if arm.label == self.reference), self.arms[0])
 
 
-_LABELS = {  # a method that is not named here stands under its own name
-    "tmcl": "T-MCL",
-    "mcl": "MCL",
-    "pets": "PETS",
-    "mh-pets": "Multi-Headed PETS",
-    "vanilla": "Vanilla",
-    "stacked": "Stacked",
-    "cadm": "Vanilla + CaDM",
-    "pets-cadm": "PETS + CaDM",
-    "grbal": "GrBAL",
-    "rebal": "ReBAL",
-    "ria": "RIA",
-    "oracle-params": "Oracle parameters",
-    "true-dynamics": "True dynamics",
-    "random": "Random",
-}
-
-
-_METHODS = tuple(Arm(_LABELS.get(name, name), name) for name in METHODS)
+_METHODS = tuple(Arm(name, name) for name in METHODS)
 _AVERAGE = {"planner.head_selection": "average"}
 # The preset `released-code` would skip the only transition.
 _ONLY_NEWEST = {"planner.selection_length": 1, "planner.selection_skips_newest": False}
@@ -90,8 +72,8 @@ _EXPERIMENTS = (
     Experiment(
         "fig10",
         "PETS with one head and with several",
-        (Arm("PETS", "pets"), Arm("Multi-Headed PETS", "mh-pets")),
-        "Multi-Headed PETS",
+        (Arm("pets", "pets"), Arm("mh-pets", "mh-pets")),
+        "mh-pets",
     ),
     Experiment(
         "fig11",
@@ -103,7 +85,7 @@ _EXPERIMENTS = (
         "with and without context learning",
         (Arm("with context"), Arm("without context", settings=NO_CONTEXT)),
     ),
-    Experiment("fig13", "MCL and T-MCL", (Arm("MCL", "mcl"), Arm("T-MCL")), "T-MCL"),
+    Experiment("fig13", "MCL and T-MCL", (Arm("mcl", "mcl"), Arm("tmcl")), "tmcl"),
     Experiment(
         "fig14",
         "number of prediction heads H",
@@ -125,29 +107,6 @@ _EXPERIMENTS = (
             *_values("N", "planner.selection_length", 5, 10, 20, 50),
         ),
         "N = 10",
-    ),
-    Experiment(
-        "heads",
-        "T-MCL with heads and without",
-        (Arm("three heads"), Arm("one head", settings={"model.num_heads": 1})),
-    ),
-    Experiment(
-        "selection",
-        "which head plans",
-        (
-            Arm("adaptive"),
-            Arm("average", settings=_AVERAGE),
-            Arm("random", settings={"planner.head_selection": "random"}),
-        ),
-    ),
-    Experiment(
-        "oracle",
-        "what a head wins: trajectory segments, transitions, nothing",
-        (
-            Arm("trajectory-wise"),
-            Arm("transition-wise", "mcl"),
-            Arm("independent", settings={"fitting.oracle": "independent"}),
-        ),
     ),
 )
 
@@ -191,7 +150,7 @@ def sweep_experiment(
     for method in methods:
         for values in itertools.product(*grid.values()):
             chosen = dict(zip(grid, values, strict=True))
-            parts = [_LABELS.get(method, method), *(f"{n} {v}" for n, v in chosen.items())]
+            parts = [method, *(f"{n} {v}" for n, v in chosen.items())]
             arms.append(Arm(", ".join(parts), method, chosen))
     labels = [arm.label for arm in arms]
     if not labels or len(set(labels)) < len(labels):

@@ -109,7 +109,6 @@ def write_report(runs: Sequence[str | Path], out: str | Path = "report.html") ->
         "episode": episodes,
         "prediction-error": page.per_env(_prediction_error),
         "settings": page.per_env(_settings),
-        "times": page.per_env(_times),
         "runs": [_runs(page)],
         "numbers": [_numbers(page)],
     }
@@ -274,13 +273,8 @@ def _physics(page: Page, env: str) -> Block:
     panels, names = [], ["score"] * (env in page.scored) + ["return per episode"]
     for name in names if shown else ():
         table = own if name == "score" else own.assign(value=own.return_mean)
-        draw = partial(figures.by_physics, table=table, looks=shown, name=name, joined=True)
+        draw = partial(figures.by_physics, table=table, looks=shown, name=name)
         panels.append(page.panel(f"{name} by physics", draw, env, size=(3.7, 3.05)))
-    for group in _groups(own) if own["run"].nunique() > 1 else ():
-        values = own[own.group == group].groupby(["label", "run"]).value.mean().reset_index()
-        draw = partial(figures.dots, table=values, looks=shown, name=names[0])
-        size = (3.7, 0.9 + 0.265 * len(shown))
-        panels.append(page.panel(group_label(group), draw, env, size=size))
     return {"panels": panels}
 
 
@@ -381,29 +375,17 @@ def _settings(page: Page, env: str) -> Block:
     return {"table": {**_table(["setting", *settings], lines), "code": 0}}
 
 
-def _times(page: Page, env: str) -> Block:
-    own = page.of_env(page.runs, env)
-    own = own[own["run"].isin(page.found.finished)]
-    means = own.groupby("label", sort=False)[list(PHASES)].mean()
-    longest = max(means.sum(axis=1), default=0) or 1.0
-    lines = []
-    for label, minutes in means.iterrows():
-        device = ", ".join(sorted(own.device[own.label == label].unique()))
-        numbers = [_number(value, "{:,.1f}") for value in (*minutes, minutes.sum())]
-        bar = {"widths": [100 * value / longest for value in minutes]}
-        lines.append(page.line(str(label), *numbers, bar, device))
-    columns = ["method", *(f"{phase}, min" for phase in PHASES), "all, min", "", "device"]
-    return {"table": _table(columns, lines, range(1, 5))}
-
-
 def _runs(page: Page) -> Block:
     lines = []
     for run in page.found.runs.itertuples():
         label = f"{run.label} (reference)" if run.is_reference else str(run.label)
         done = f"{run.iterations} of {run.planned}"
-        lines.append(page.line(label, run.env, str(run.seed), done, run.preset, run.run))
-    columns = ["method", "environment", "seed", "iterations", "preset", "directory"]
-    return {"table": {**_table(columns, lines, (2, 3)), "code": 5}}
+        minutes = (f"{getattr(run, phase):,.1f}" for phase in PHASES)
+        cells = run.env, str(run.seed), done, *minutes, run.device, run.preset, run.run
+        lines.append(page.line(label, *cells))
+    times = [f"{phase}, min" for phase in PHASES]
+    columns = ["environment", "seed", "iterations", *times, "device", "preset", "directory"]
+    return {"table": {**_table(["method", *columns], lines, range(2, 7)), "code": 9}}
 
 
 def _numbers(page: Page) -> Block:

@@ -63,7 +63,7 @@ class Runs:
     episodes: pd.DataFrame
     """Test episodes: iteration, group, sim_params, episode, return, score (NaN: unknown)."""
     curves: pd.DataFrame
-    """Mean and std of returns by iteration, timesteps and group; `collected` while collecting."""
+    """Mean returns by iteration, timesteps and group; `collected` while collecting."""
     collected: pd.DataFrame
     """Episodes collected for training: iteration, group, episode, return."""
     assignments: pd.DataFrame
@@ -202,10 +202,9 @@ def _summaries(metrics: str) -> dict[str, Any]:
             returns = enumerate(map(float, line["collection"]["returns"]))
             collected += [(when, COLLECTED, episode, value) for episode, value in returns]
         for group, summary in summaries.items():
-            numbers = (float(summary["return_mean"]), float(summary["return_std"]))
-            curves.append((when, int(line["timesteps"]), group, *numbers))
+            curves.append((when, int(line["timesteps"]), group, float(summary["return_mean"])))
     seconds = [line.get("seconds", {}) for line in lines]
-    columns = ["iteration", "timesteps", "group", "return", "std"]
+    columns = ["iteration", "timesteps", "group", "return"]
     return {
         "iterations": len(lines),
         **{phase: sum(s.get(phase, 0.0) for s in seconds) / 60 for phase in PHASES},
