@@ -69,10 +69,8 @@ def test_a_perfect_head_is_found_and_costs_nothing():
     episodes = [toys.random_trajectory(12, seed=s, gain=g) for s, g in enumerate((1.0, -1.0, 1.0))]
     found = examine(agent.model, episodes, key=jax.random.key(0))
     np.testing.assert_array_equal([e.best for e in found], [[0, 1], [1, 0], [0, 1]])
-    summary = summarise(found, window=3)
+    summary = summarise(found)
     assert summary.wrong_selections == 0
-    assert summary.settling_steps == 1
-    assert summary.settled == 1
     assert summary.chosen_error == pytest.approx(0, abs=1e-9)
     assert summary.regret == pytest.approx(0, abs=1e-9)
     assert summary.average_error > 0.1
@@ -83,7 +81,7 @@ def test_regret_and_wrong_selections_by_hand():
     # Head 1 is best in hindsight (errors 1+1+1+1 against 0+4+4+4).
     episode = by_hand([[0, 1], [4, 1], [4, 1], [4, 1]], [0, 0, 1, 1])
     np.testing.assert_array_equal(episode.best, [1])
-    summary = summarise([episode], window=2)
+    summary = summarise([episode])
     assert summary.best_error == 1
     assert summary.chosen_error == (0 + 4 + 1 + 1) / 4
     assert summary.regret == pytest.approx(0.5)
@@ -93,39 +91,15 @@ def test_regret_and_wrong_selections_by_hand():
 
 
 def test_switching_can_beat_every_single_head():
-    summary = summarise([by_hand([[0, 2], [2, 0]], [0, 1])], window=1)
+    summary = summarise([by_hand([[0, 2], [2, 0]], [0, 1])])
     assert summary.regret == -1
-
-
-@pytest.mark.parametrize(
-    ("chosen", "window", "settles"),
-    [
-        ([1, 1, 1, 1, 1], 2, 1),
-        ([0, 1, 1, 1, 1], 2, 2),
-        ([1, 0, 1, 0, 1], 2, np.nan),
-        ([1, 0, 0, 1, 1], 2, 4),
-        ([1, 0, 1, 1, 1], 3, 3),
-        ([1, 1, 1, 1, 1], 6, np.nan),
-    ],
-)
-def test_settling(chosen, window, settles):
-    episode = by_hand([[1, 0]] * 5, chosen)
-    np.testing.assert_array_equal(episode.settling(window), [settles])
-
-
-def test_what_never_settles_is_counted():
-    right, wrong = by_hand([[1, 0]] * 4, [0, 1, 1, 1]), by_hand([[1, 0]] * 4, [0, 1, 0, 1])
-    summary = summarise([right, right, wrong], window=2)
-    assert summary.settling_steps == 2
-    assert summary.settled == pytest.approx(2 / 3)
-    assert summarise([wrong], window=2).settling_steps is None
 
 
 @pytest.mark.parametrize("spread", [1.0, 2.0])
 def test_calibration(spread):
     deviations = spread * np.random.default_rng(0).normal(size=(4000, 1, 3))
     episode = EpisodeSelection({}, np.zeros((4000, 1, 1)), np.zeros((4000, 1), int), deviations)
-    calibration = summarise([episode], window=3).calibration
+    calibration = summarise([episode]).calibration
     assert calibration.mean_square == pytest.approx(spread**2, rel=0.03)
     for level, inside in calibration.inside.items():
         if spread == 1:

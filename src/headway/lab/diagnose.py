@@ -35,25 +35,20 @@ class Diagnosis(JupyterMixin):
     episodes: dict[str, list[selection.EpisodeSelection]]
     """Predictions of all heads, by group and in the order of the episodes."""
 
-    @property
-    def window(self) -> int:
-        """Right selections in a row after which selection has settled: as many as it looks at."""
-        return self.config.planner.selection_length
-
     def __rich__(self) -> Group:
         """The tables that `headway diagnose` prints."""
         return Group(*tables(self))
 
     def summary(self, group: str) -> selection.SelectionSummary:
         """The averages of a group."""
-        return selection.summarise(self.episodes[group], self.window)
+        return selection.summarise(self.episodes[group])
 
     def by_physics(self, group: str) -> list[tuple[dict[str, float], selection.SelectionSummary]]:
         """The averages of each physics of a group, in ascending order."""
         found = []
         for physics in distinct(episode.sim_params for episode in self.episodes[group]):
             same = [e for e in self.episodes[group] if dict(e.sim_params) == physics]
-            found.append((physics, selection.summarise(same, self.window)))
+            found.append((physics, selection.summarise(same)))
         return found
 
 
@@ -137,14 +132,14 @@ def facts(diagnosis: Diagnosis) -> dict[str, Any]:
     for group in diagnosis.episodes:
         physics = [{"sim_params": p, **plain(found)} for p, found in diagnosis.by_physics(group)]
         groups.append({"group": group, **plain(diagnosis.summary(group)), "physics": physics})
-    return {"run_dir": str(diagnosis.path), "settled_after": diagnosis.window, "groups": groups}
+    return {"run_dir": str(diagnosis.path), "groups": groups}
 
 
 def tables(diagnosis: Diagnosis) -> list[Table]:
     """Lay a diagnosis out: selection, errors of each head, calibration."""
     names = varying([e.sim_params for episodes in diagnosis.episodes.values() for e in episodes])
     groups = {group: diagnosis.summary(group) for group in diagnosis.episodes}
-    numbers = ["episodes", "chosen", "best", "average", "regret", "wrong", "settles", "settled"]
+    numbers = ["episodes", "chosen", "best", "average", "regret", "wrong"]
     chosen = new_table(f"Head selection: {diagnosis.path}", "physics", numbers=numbers)
     count = max((summary.head_errors.shape[1] for summary in groups.values()), default=0)
     numbers = [*(f"head {head}" for head in range(count)), "best head"]
@@ -160,10 +155,8 @@ def tables(diagnosis: Diagnosis) -> list[Table]:
             style = "bold" if found is summary else None
             errors = (found.chosen_error, found.best_error, found.average_error)
             relative = found.best_error and f"{found.regret / found.best_error:+.1%}"
-            settles = "never" if found.settling_steps is None else f"{found.settling_steps:g}"
             cells = [str(found.episodes), *(f"{error:.3g}" for error in errors), relative or "–"]
-            cells += [f"{found.wrong_selections:.0%}", settles, f"{found.settled:.0%}"]
-            chosen.add_row(name, *cells, style=style)
+            chosen.add_row(name, *cells, f"{found.wrong_selections:.0%}", style=style)
             if found.calibration is not None:
                 shares = [f"{found.calibration.inside[level]:.1%}" for level in selection.LEVELS]
                 mean_square = f"{found.calibration.mean_square:.3g}"
@@ -175,9 +168,7 @@ def tables(diagnosis: Diagnosis) -> list[Table]:
         heads.add_section()
     chosen.caption = (
         "errors: mean squares in normalised units, of the chosen head, the best one of each episode"
-        " in hindsight, and all heads; regret: chosen above best; wrong: chosen is not the best;"
-        f" settles: transitions seen before the best is chosen {diagnosis.window} times in a row"
-        " (median); settled: share of episodes and members where that happens"
+        " in hindsight, and all heads; regret: chosen above best; wrong: chosen is not the best"
     )
     if diagnosis.config.planner.head_selection == "average":
         chosen.caption += ". This run plans with the average; chosen is what it would select."

@@ -40,18 +40,6 @@ class EpisodeSelection:
         """The head that would have been best for the whole episode, in hindsight."""
         return self.errors.sum(0).argmin(-1)
 
-    def settling(self, window: int) -> Float[np.ndarray, " member"]:
-        """Transitions that are seen before the best head is chosen `window` times in a row.
-
-        NaN for a member that never gets that far.
-        """
-        right = self.chosen == self.best
-        if len(right) < window:
-            return np.full(right.shape[1], np.nan)
-        runs = np.lib.stride_tricks.sliding_window_view(right, window, axis=0).all(-1)
-        first = runs.argmax(0) + 1.0  # the first selection has seen one transition
-        return np.where(runs.any(0), first, np.nan)
-
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
@@ -79,10 +67,6 @@ class SelectionSummary:
     """Error of a head chosen blindly."""
     wrong_selections: float
     """Share of selections that are not the best head in hindsight."""
-    settling_steps: float | None
-    """Median number of transitions seen before selection settles; None if it never does."""
-    settled: float
-    """Share of episodes and members in which it settles."""
     calibration: Calibration | None
     """None for a model that predicts no variance."""
 
@@ -157,18 +141,11 @@ def _predict(
     return jax.lax.scan(step, model.init_belief(1, sim_params), steps)[1]
 
 
-def summarise(episodes: Sequence[EpisodeSelection], window: int) -> SelectionSummary:
-    """Average over episodes; each step of each episode and member counts once.
-
-    Args:
-        episodes: At least one.
-        window: Right selections in a row after which selection has settled.
-    """
+def summarise(episodes: Sequence[EpisodeSelection]) -> SelectionSummary:
+    """Average over episodes, at least one; each step of each episode and member counts once."""
     errors = np.concatenate([episode.errors for episode in episodes])
     chosen = [np.take_along_axis(e.errors, e.chosen[..., None], -1) for e in episodes]
     best = [np.take_along_axis(e.errors, e.best[None, :, None], -1) for e in episodes]
-    settling = np.concatenate([episode.settling(window) for episode in episodes])
-    settled = ~np.isnan(settling)
     wrong = np.concatenate([episode.chosen != episode.best for episode in episodes])
     calibration = None
     seen = [e.deviations.ravel() for e in episodes if e.deviations is not None]
@@ -184,7 +161,5 @@ def summarise(episodes: Sequence[EpisodeSelection], window: int) -> SelectionSum
         float(np.concatenate(best).mean()),
         float(errors.mean()),
         float(wrong.mean()),
-        float(np.median(settling[settled])) if settled.any() else None,
-        float(settled.mean()),
         calibration,
     )
