@@ -35,12 +35,8 @@ def make_agent(
 
 
 def planners() -> dict[str, PlannerConfig]:
-    """The paper's planner in each precision of matrix products, and the fastest setting."""
-    return {
-        "float32": PlannerConfig(),
-        "bfloat16": PlannerConfig(precision="bfloat16"),
-        "bfloat16, shared noise": PlannerConfig(precision="bfloat16", particle_noise="shared"),
-    }
+    """The paper's planner in each precision of matrix products."""
+    return {"float32": PlannerConfig(), "bfloat16": PlannerConfig(precision="bfloat16")}
 
 
 def make_trajectories(task: Task, num_episodes: int, length: int) -> list[Trajectory]:

@@ -33,7 +33,6 @@ PLANNERS = {
     "mppi": {"planner.optimizer.name": "mppi"},
     "random-shooting": {"planner.optimizer.name": "random-shooting"},
     "bfloat16": {"planner.precision": "bfloat16"},
-    "shared": {"planner.particle_noise": "shared"},
 }
 RUNS = {
     **{name: ("pendulum", name, {}) for name in (*WITH_HEADS, "grbal", "rebal", "random")},

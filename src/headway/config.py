@@ -354,9 +354,9 @@ class PlannerConfig:
     """Imagined rollouts per candidate: a multiple of `model.num_members`, or 1: each candidate is
     imagined by one member, and compared with those of the same one (wants `particle_noise` none).
     """
-    particle_noise: Literal["independent", "shared", "none"] = "independent"
-    """Noise of imagined steps: every candidate's own; shared by all, which is faster and compares
-    candidates under equal luck; or none: steps are the predicted means, one rollout a member."""
+    particle_noise: Literal["independent", "none"] = "independent"
+    """Noise of imagined steps: every rollout's own, or none: steps are the predicted means, one
+    rollout a member."""
     precision: Precision = "float32"
     """Type of the networks' products while planning; sums and states are always float32."""
     head_selection: Literal["adaptive", "average", "random"] = "adaptive"
@@ -422,11 +422,10 @@ class EvaluationConfig:
     """Tests of controllers; test episodes have fixed seeds, the same for every method."""
 
     every: Count = 1
-    """Iterations between tests on the unseen groups; the last iteration is always tested."""
+    """Iterations between tests on the unseen groups; the last iteration is always tested, on the
+    training physics too."""
     num_episodes: Annotated[int, Field(strict=True, ge=1, le=1000)] = 10
     """Episodes per group, spread evenly over the group's simulator parameters."""
-    training_group: Literal["last", "always"] = "last"
-    """When the training physics are tested too: after the last iteration, or at every test."""
     seed: Annotated[int, Field(strict=True, ge=0, le=2**30)] = 10_000
     """Seed of the first test episode; the others follow it."""
     max_bad_episodes: CountOrNone = 0

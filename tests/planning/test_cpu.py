@@ -38,7 +38,7 @@ def sharing(monkeypatch):
     [
         (1, {"reward": "released", "selection_error": "sampled", "selection_skips_newest": True}),
         (2**20, {"num_candidates": 2, "optimizer": CEMConfig(num_elites=1)}),  # side by side
-        (1, {"num_candidates": 41, "precision": "bfloat16", "particle_noise": "shared"}),
+        (1, {"num_candidates": 41, "precision": "bfloat16"}),
         (2**20, {"num_candidates": 41, "num_particles": 1, "particle_noise": "none"}),
         *(
             pytest.param(caches, {"optimizer": optimizer}, marks=pytest.mark.slow)

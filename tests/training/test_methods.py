@@ -61,7 +61,7 @@ def test_released_code_preset_flips_the_choices_that_differ():
 def test_method_wins_over_preset_and_user_over_both():
     for settings, particles in (
         ({}, 1),
-        ({"planner.num_particles": 4, "planner.particle_noise": "shared"}, 4),
+        ({"planner.num_particles": 4, "planner.particle_noise": "independent"}, 4),
     ):
         config = make_config("pendulum", method="vanilla", preset="quick", settings=settings)
         assert config.planner.num_particles == particles

@@ -31,6 +31,9 @@ from headway.models.networks import Dense
 from headway.models.statistics import Statistics, network_input
 from headway.task import Task
 
+glorot = jax.nn.initializers.glorot_uniform(batch_axis=0)
+"""Uniform draws of variance 2 / (in + out), [member, in, out] (Glorot and Bengio, 2010)."""
+
 
 class ReluNet(eqx.Module):
     """A plain network that predicts the normalised `delta`."""
@@ -175,12 +178,6 @@ def window(
     obs, action = episodes.obs[rows, step], episodes.action[rows, step]
     transitions = obs, action, episodes.obs[rows, step + 1]
     return Window.of(task, data.statistics, transitions, inside.astype(jnp.float32))
-
-
-def glorot(key: PRNGKeyArray, shape: tuple[int, ...]) -> Array:
-    """Uniform draws of variance 2 / (in + out), [..., in, out] (Glorot and Bengio, 2010)."""
-    limit = (6.0 / (shape[-2] + shape[-1])) ** 0.5
-    return jax.random.uniform(key, shape, minval=-limit, maxval=limit)
 
 
 class GrBAL(Model):

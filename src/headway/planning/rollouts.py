@@ -61,10 +61,10 @@ def candidate_returns(
     alone = planner.num_particles < ensemble  # each candidate has one member
     particles = 1 if alone else planner.num_particles // ensemble
     reward = task.released_reward if planner.reward == "released" else task.reward
-    noise = planner.particle_noise if dynamics.stochastic else "none"
+    noisy = dynamics.stochastic and planner.particle_noise != "none"
     # On a CPU noise is drawn before a rollout: XLA would draw it again for every operation of a
     # step that uses it. Elsewhere that would take too much memory.
-    in_steps = noise == "independent" and jax.default_backend() != "cpu"
+    in_steps = jax.default_backend() != "cpu"
 
     def roll_out(
         some: Dynamics, first: Int[Array, ""], obs, candidates, key
@@ -78,14 +78,11 @@ def candidate_returns(
             start, size = (first, 0, 0, first_candidate), (members, obs_size, particles)
             return cpu.normal_block(key, whole, start, (*size, num_candidates))
 
-        if noise == "shared":
-            of_all = jax.random.normal(key, (horizon, ensemble, obs_size, particles))[..., None]
-            step_noise = jax.lax.dynamic_slice_in_dim(of_all, first, members, axis=1)
-        elif noise == "independent":
+        if noisy:
             keys = jax.random.split(key, horizon)
             step_noise, draw = (keys, drawn) if in_steps else (jax.vmap(drawn)(keys), None)
-        noisy = step_noise, draw
-        return rollout_returns(some, task, reward, obs, candidates, particles, noisy)
+        noise = step_noise, draw
+        return rollout_returns(some, task, reward, obs, candidates, particles, noise)
 
     bytes_per_env = 4 * dynamics.widest * planner.num_particles * num_candidates
     budget = cpu.activation_budget() if shard is None else cpu.CACHES_OF_CORE

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from headway.config import BUILT_IN_KINDS, TOLERANCE, Config, known_settings, override
-from headway.errors import ConfigError, unknown_name
+from headway.errors import ConfigError, check_names
 from headway.task import (
     BUILT_IN,
     EnvSpec,
@@ -303,8 +303,7 @@ def make_config(
     """
     spec = env_spec(env)
     for kind, name, table in (("method", method, METHODS), ("preset", preset, PRESETS)):
-        if name not in table:
-            raise unknown_name(kind, name, table)
+        check_names(kind, [name], table)
     for name in ("env", "method", "preset", "seed"):
         if name in (settings or {}):
             raise ConfigError(f"{name} is no setting to override; pass it as {name}=... instead.")
