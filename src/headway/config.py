@@ -359,8 +359,8 @@ class PlannerConfig:
     rollout a member."""
     precision: Precision = "float32"
     """Type of the networks' products while planning; sums and states are always float32."""
-    head_selection: Literal["adaptive", "average", "random"] = "adaptive"
-    """Head that plans: the best on recent transitions, their average, or a random one."""
+    head_selection: Literal["adaptive", "average"] = "adaptive"
+    """Head that plans: the best on recent transitions, or the average of all."""
     selection_length: Count = 10
     """Past transitions on which heads compete (N)."""
     selection_error: Literal["mean", "sampled"] = "mean"

@@ -95,4 +95,4 @@ def test_experiments_are_listed_with_their_arms(capsys):
     assert main(["list", "experiments", "--json"]) == 0
     entries = json.loads(capsys.readouterr().out)["experiments"]
     assert [entry["name"] for entry in entries] == list(EXPERIMENTS)
-    assert entries[-1]["arms"][2]["settings"] == {"fitting.oracle": "independent"}
+    assert entries[-1]["arms"][2]["settings"] == {"planner.selection_length": 10}

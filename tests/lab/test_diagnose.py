@@ -86,14 +86,12 @@ def test_the_tests_of_a_run_are_not_run_again(reference, two_iterations, monkeyp
 
 
 def test_how_heads_would_be_selected(reference):
-    changes = {}, {"planner.adaptation": "last-layer"}, {"planner.head_selection": "random"}
-    selected, learning, drawn = (
+    changes = {}, {"planner.adaptation": "last-layer"}
+    selected, learning = (
         headway.diagnose(reference, groups=["high"], settings=settings).summary("high")
         for settings in changes
     )
     assert learning.chosen_error < 0.7 * selected.chosen_error
-    np.testing.assert_array_equal(drawn.head_errors, selected.head_errors)
-    assert drawn.wrong_selections > selected.wrong_selections
     with pytest.raises(ConfigError, match="cannot change here"):
         headway.diagnose(reference, settings={"model.num_heads": 2})
 

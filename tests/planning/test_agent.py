@@ -55,11 +55,6 @@ def test_same_state_same_action_and_the_key_moves_on():
     assert (first.action[0] != beside.action[0]).any()
 
 
-def test_random_selection_ignores_the_data_and_draws_anew_at_every_step():
-    _, _, decisions = play(toys.make_agent(head_selection="random"), [1.0, 1.0], 25)
-    assert len({str(decision.heads[0].tolist()) for decision in decisions}) == 4
-
-
 def test_averaging_plans_with_all_heads_and_reports_the_adaptive_one():
     agent = toys.make_agent(head_selection="average")
     state, _, decisions = play(agent, [1.0, -1.0], 2)

@@ -263,8 +263,6 @@ class MultiHeadModel(Model):
         obs, action, next_obs = (x[:, newest] for x in recent[:3])
         num_slots, available = obs.shape[1], recent.count - skipped
         used = jnp.arange(num_slots) >= num_slots - available[:, None]
-        if planner.head_selection == "random":
-            used = jnp.zeros_like(used)
         sampling_key = error_key if planner.selection_error == "sampled" else None
         errors = self.head_errors((obs, action, next_obs), context, sampling_key=sampling_key)
         return select_heads(errors, used, key=head_key)

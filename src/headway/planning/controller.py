@@ -71,6 +71,13 @@ class Controller:
         ConfigError: The deadline is not positive, or the agent makes no plans.
     """
 
+    status: Status | None
+    """The way in which the last action was found; None before the first."""
+    heads: Int[np.ndarray, " member"] | None
+    """The prediction head that each member plans with now; None before the first action, and where
+    the model has no heads. With `head_selection="average"`, which plans with all heads, the one
+    that explains the recent past best."""
+
     def __init__(
         self,
         agent: Agent,
@@ -107,10 +114,10 @@ class Controller:
         task, planner = self.agent.task, self.agent.planner
         search = f"{planner.optimizer.name}, horizon {planner.horizon}"
         search, last = search if self.agent.model else "random actions", ""
-        if self._status:
-            last = f"; {self._status.outcome} in {1e3 * self._status.seconds:.3g} ms"
-        if self._heads is not None:
-            last += f", heads {' '.join(map(str, self._heads))}"
+        if self.status:
+            last = f"; {self.status.outcome} in {1e3 * self.status.seconds:.3g} ms"
+        if self.heads is not None:
+            last += f", heads {' '.join(map(str, self.heads))}"
         return f"Controller({task.obs_size} numbers in, {task.action_size} out; {search}{last})"
 
     def reset(self, sim_params: Mapping[str, float] | None = None) -> None:
@@ -128,8 +135,7 @@ class Controller:
         self._state: Any = None
         if sim_params is not None or not self.agent.sim_param_names:
             self._state = self.agent.init(1, key=key, sim_params=[sim_params or {}])
-        self._heads: Int[np.ndarray, " member"] | None = None
-        self._status: Status | None = None
+        self.heads = self.status = None
         self._left = 0  # steps of the last plan that are still to come
 
     def act(
@@ -172,12 +178,12 @@ class Controller:
             reason = f"obs[{entry}] is {row[entry]}, allowed: finite numbers; check the sensor"
             self._count_left(held=True, reason=reason)
             action = self._hold()
-            self._status = Status("held", reason, (), 0, self._clock() - started)
+            self.status = Status("held", reason, (), 0, self._clock() - started)
             return action
         unlike = self._unlike_training(row)
         decision, done = self._search(row, started)
         scaled, heads, failures, _ = jax.device_get(decision)
-        self._heads = None if heads is None else heads[0]
+        self.heads = None if heads is None else heads[0]
         reason, held = "", bool(failures[0] >= done)
         if done == 0:
             reason = "no iteration of the planner fits the deadline"
@@ -187,24 +193,8 @@ class Controller:
             reason = f"time was up after {done} of {self._num_iterations} iterations"
         self._count_left(held=held, reason=reason)
         outcome = "held" if held else "deadline" if done < self._num_iterations else "planned"
-        self._status = Status(outcome, reason, unlike, done, self._clock() - started)
+        self.status = Status(outcome, reason, unlike, done, self._clock() - started)
         return env_action(task, scaled[0])
-
-    @property
-    def status(self) -> Status | None:
-        """The way in which the last action was found; None before the first."""
-        return self._status
-
-    @property
-    def heads(self) -> Int[np.ndarray, " member"] | None:
-        """The prediction head that each member plans with now.
-
-        None before the first action, and where the model has no heads.
-
-        With `head_selection="average"`, which plans with all heads, the one that explains the
-        recent past best.
-        """
-        return self._heads
 
     def imagine(self) -> Float[np.ndarray, "member horizon obs"] | None:
         """Observations that each member expects along the last plan, without noise.
@@ -212,7 +202,7 @@ class Controller:
         The first one is its prediction of the next observation. None where there is no new plan:
         before the first action, while a plan is held, and where the agent makes none.
         """
-        if self.agent.model is None or self._status is None or self._status.outcome == "held":
+        if self.agent.model is None or self.status is None or self.status.outcome == "held":
             return None
         return jax.device_get(_imagine(self.agent, self._state))[:, 0]
 

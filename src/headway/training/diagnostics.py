@@ -29,7 +29,7 @@ def prediction_error(
         trajectories: Real episodes.
         first: Steps of an episode before the first moment.
         horizon: Imagined steps.
-        key: Draws of a head selection that is random or sampled.
+        key: Draws heads where nothing was observed, and samples of a sampled selection.
     """
     starts = [(t, s) for t in trajectories for s in range(first, len(t) - horizon + 1)]
     if not starts:
@@ -51,7 +51,7 @@ def imagine_from(
         model: It has lived through what went before.
         starts: Episodes and steps, with `horizon` actions from there on.
         horizon: Imagined steps.
-        key: Draws of a head selection that is random or sampled.
+        key: Draws heads where nothing was observed, and samples of a sampled selection.
     """
     slots = max(len(t) for t, _ in starts) if model.memory is None else max(model.memory, 1)
 

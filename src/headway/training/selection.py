@@ -84,7 +84,7 @@ def examine(
     Args:
         model: The agent's, with its selection of heads.
         trajectories: The episodes; those of a single transition are left out.
-        key: Draws of a selection that is random or sampled.
+        key: Draws heads where nothing was observed, and samples of a sampled selection.
     """
     episodes = [trajectory for trajectory in trajectories if len(trajectory) > 1]
     longest = max((len(trajectory) for trajectory in episodes), default=0)

@@ -21,8 +21,8 @@ class Search(NamedTuple):
 
     nominal: Float[Array, "env horizon action"]
     """The nominal plan: what candidates are drawn around, and what the next step starts from."""
-    expected_return: Float[Array, " env"]
-    """Return of the plan as its optimizer estimates it; -inf where nothing was finite."""
+    best_return: Float[Array, " env"]
+    """Return of the plan, where it is the best candidate of all iterations; else -inf."""
     non_finite: Int[Array, " env"]
     """Iterations in which no candidate had a finite return; they change nothing else."""
     evaluations: Int[Array, " env"]

@@ -9,8 +9,7 @@ from headway.planning.optimizers.base import Optimizer, best_candidates, moments
 class CEM(Optimizer):
     """Cross-entropy method with clipped variance and smoothing (PETS; released `core/utils.py`).
 
-    It plans the final mean, not the best candidate. The expected return is the mean over the
-    finite elites of the last iteration.
+    It plans the final mean, not the best candidate.
     """
 
     num_elites: int = 50
@@ -40,11 +39,9 @@ class CEM(Optimizer):
         # Keep a share of the old distribution; keep all of it where nothing was finite.
         found = finite.any(-1)
         keep = jnp.where(found[:, None, None], self.smoothing, 1.0)
-        total = jnp.where(finite, elite_returns, 0.0).sum(-1)
         return search._replace(
             nominal=keep * search.nominal + (1.0 - keep) * mean,
             std=jnp.sqrt(keep * jnp.square(search.std) + (1.0 - keep) * var),
-            expected_return=jnp.where(found, total / jnp.maximum(finite.sum(-1), 1), -jnp.inf),
             non_finite=search.non_finite + ~found,
             evaluations=search.evaluations + self.num_candidates,
         )

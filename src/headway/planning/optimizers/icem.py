@@ -18,7 +18,7 @@ class ICEM(Optimizer):
     Candidates are clipped to the bounds. Fewer are drawn in each iteration. A share of the
     elites competes again in the next iteration and, moved on by one step, in the next search;
     they are scored anew, because `score` may be random. In the last iteration the mean competes
-    too. The plan is the best elite of the last iteration, and the expected return its return.
+    too. The plan is the best elite of the last iteration.
     """
 
     num_elites: int = 10
@@ -72,7 +72,6 @@ class ICEM(Optimizer):
             std=keep * search.std + (1.0 - keep) * jnp.sqrt(var),
             elites=jnp.where(finite[..., None, None], elites, jnp.inf)[:, : self.num_kept],
             best=elites[:, 0],
-            expected_return=elite_returns[:, 0],
         )
         failed = search._replace(non_finite=search.non_finite + 1)
         return where_env(finite[:, 0], learned, failed)

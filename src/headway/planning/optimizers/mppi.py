@@ -15,8 +15,7 @@ class MPPI(Optimizer):
     tasks whose rewards differ in scale, and a few very bad candidates do not matter. The
     candidates' deviation stays `initial_std`. They are clipped to the bounds, and the cost of
     control is what the return says: the method's own term for it, which weighs the noise against
-    the mean, is left out, as for a base distribution centred at the mean. The expected return is
-    the weighted mean return of the last iteration.
+    the mean, is left out, as for a base distribution centred at the mean.
     """
 
     initial_std: float = 0.5
@@ -36,10 +35,8 @@ class MPPI(Optimizer):
         weights = softmax_weights(returns, self.temperature)
         found = jnp.isfinite(returns).any(-1)
         average = (weights[..., None, None] * candidates).sum(1)
-        expected = (weights * jnp.where(weights > 0, returns, 0.0)).sum(-1)
         return search._replace(
             nominal=jnp.where(found[:, None, None], average, search.nominal),
-            expected_return=jnp.where(found, expected, -jnp.inf),
             non_finite=search.non_finite + ~found,
             evaluations=search.evaluations + self.num_candidates,
         )

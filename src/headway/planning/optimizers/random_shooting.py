@@ -9,7 +9,7 @@ from headway.planning.optimizers.base import Optimizer, best_candidates
 class RandomShooting(Optimizer):
     """The best of uniformly drawn sequences, drawn in rounds to bound memory.
 
-    The nominal plan is used only where nothing is finite; the expected return is the best one.
+    The nominal plan is used only where nothing is finite.
     """
 
     initial_std = 0.0
@@ -23,8 +23,8 @@ class RandomShooting(Optimizer):
         """See `Optimizer.tell`."""
         (best,), (top,) = (x.swapaxes(0, 1) for x in best_candidates(candidates, returns, 1))
         return search._replace(
-            nominal=jnp.where((top > search.expected_return)[:, None, None], best, search.nominal),
-            expected_return=jnp.maximum(search.expected_return, top),
+            nominal=jnp.where((top > search.best_return)[:, None, None], best, search.nominal),
+            best_return=jnp.maximum(search.best_return, top),
             non_finite=search.non_finite + ~jnp.isfinite(top),
             evaluations=search.evaluations + self.num_candidates,
         )
