@@ -110,7 +110,7 @@ def test_wrong_usage_exits_2_and_says_what_there_is(capsys, calls, words, text):
         ("train pendulm --help", "Did you mean 'pendulum'?"),
         ("train pendulum --method tmlc", "Did you mean 'tmcl'?"),
         ("train pendulum --preset quik", "Did you mean 'quick'?"),
-        ("train crippled-ant --env-options shrink-leg", "allowed: NAME=VALUE"),
+        ("train hopper --env-options scale-inertia", "allowed: NAME=VALUE"),
         ("train pendulum --sim-params missing.json", "missing.json"),
         ("evaluate nowhere --json", "allowed: a run directory"),
         ("plot-dynamics pendulum --num-states 0", "--num-states is 0, allowed: "),
@@ -152,8 +152,8 @@ def test_settings_are_those_that_differ_from_the_preset():
     wanted = {"planner.horizon": 7, "model.hidden_sizes": [8, 9]}
     assert asked("pendulum", *words.split()) == wanted
     assert asked("pendulum", "--model.no-backward-net") == {"model.backward_net": False}
-    switched = asked("crippled-ant", "--env-options", "shrink-leg=on")
-    assert switched["env_options"] == {"shrink_leg": True}
+    switched = asked("hopper", "--env-options", "scale-inertia=on")
+    assert switched["env_options"] == {"scale_inertia": True}
     words = ["gain=-2.0", "a-b=x-y", "sizes=[1,2]", 'table={"k":null}', 'text="on"']
     wanted = {"gain": -2.0, "a_b": "x-y", "sizes": [1, 2], "table": {"k": None}, "text": "on"}
     assert asked("pendulum", "--env-options", *words)["env_options"] == wanted

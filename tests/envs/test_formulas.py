@@ -154,16 +154,18 @@ def test_crippled_leg_shrinks_only_if_asked_for():
 
 
 @pytest.mark.parametrize("name", [n for n in ROBOTS if n != "crippled-ant"])
-def test_scales_change_what_they_say_and_nothing_else(name):
-    env = envs.make(name)
+@pytest.mark.parametrize("scale_inertia", [False, True])
+def test_scales_change_what_they_say_and_nothing_else(name, scale_inertia):
+    env = envs.make(name, scale_inertia=scale_inertia)
     nominal = env.unwrapped.vector.world.nominal
     env.reset(options={"sim_params": {"mass_scale": 0.5, "damping_scale": 3.0}})
     env.reset(options={"sim_params": {"mass_scale": 1.5, "damping_scale": 2.0}})
     model = env.unwrapped.vector.models[0]
+    inertia = 1.5 if scale_inertia else 1.0
     np.testing.assert_array_equal(model.body_mass, nominal.body_mass * 1.5)
     np.testing.assert_array_equal(model.dof_damping, nominal.dof_damping * 2.0)
-    same = "body_inertia", "dof_invweight0", "body_invweight0", "body_subtreemass", "dof_armature"
-    for field in same:
+    np.testing.assert_array_equal(model.body_inertia, nominal.body_inertia * inertia)
+    for field in ("dof_invweight0", "body_invweight0", "body_subtreemass", "dof_armature"):
         np.testing.assert_array_equal(getattr(model, field), getattr(nominal, field))
 
 

@@ -103,8 +103,8 @@ def test_bad_arguments_are_refused():
     for wrong in ({"sizes": {1, 2}}, {"gain": np.nan}):
         with pytest.raises(ConfigError, match="allowed: what JSON holds"):
             dataclasses.replace(DRIFT, options=wrong)
-    with pytest.raises(UnknownNameError, match="Did you mean 'shrink_leg'"):
-        envs.make_vec("crippled-ant", 1, options={"shrink_legs": True})
+    with pytest.raises(UnknownNameError, match="Did you mean 'scale_inertia'"):
+        envs.make_vec("hopper", 1, options={"scale_inertias": True})
     foreign = SequentialVectorEnv([lambda: gymnasium.make("Pendulum-v1")] * 2)
     foreign.reset(options={"schedule": {0: {"length": 1.0}}})
     with pytest.raises(ConfigError, match="no method set_sim_params"):
@@ -215,7 +215,7 @@ def test_environments_that_cannot_serve_are_named_in_one_line(changes, says):
 
 def test_own_physics_under_another_name_steps_as_fast():
     """A spec of one's own for a built-in id keeps its vector environment."""
-    vector = envs.make_vec("test_vector:MOON", 2)
+    vector = envs.make_vec("test_vector:MOON", 2, options={"scale_inertia": True})
     assert isinstance(vector, RobotVectorEnv)
     assert vector.episode_length == 50
     sim_params = vector.reset(options={"sim_params": {"damping_scale": 2.0}})[1]["sim_params"]

@@ -80,10 +80,14 @@ class Robot(World):
         """Scale the nominal masses and damping.
 
         As in the released code only `body_mass` and `dof_damping` change: rotational inertia
-        and the constants that MuJoCo derives keep their values.
+        and the constants that MuJoCo derives keep their values. The option `scale_inertia`
+        scales `body_inertia` with the mass.
         """
-        model.body_mass[:] = self.nominal.body_mass * sim_params["mass_scale"]
+        mass = sim_params["mass_scale"]
+        model.body_mass[:] = self.nominal.body_mass * mass
         model.dof_damping[:] = self.nominal.dof_damping * sim_params["damping_scale"]
+        if self.task.scale_inertia:
+            model.body_inertia[:] = self.nominal.body_inertia * mass
 
     def control(self, action: np.ndarray, sim_params: Mapping[str, Any]) -> np.ndarray:
         """Return what the actuators receive."""
@@ -131,6 +135,8 @@ class HopperTask(Task):
     action_size = 3
     action_low, action_high = (-1.0,) * 3, (1.0,) * 3
 
+    scale_inertia: bool = False
+    """Apply the mass scale to the rotational inertia too."""
     observe_average_velocity: bool = True
     """Observe the average forward velocity as the last entry."""
 
@@ -183,7 +189,7 @@ HOPPER = EnvSpec(
     sim_params=_mass_sets((0.5, 0.75, 1.0, 1.25, 1.5), (0.25, 0.375), (1.75, 2.0)),
     episode_length=500,
     default_sim_params={"mass_scale": 1.0, "damping_scale": 1.0},
-    options={"observe_average_velocity": True},
+    options={"scale_inertia": False, "observe_average_velocity": True},
     quick=QUICK_OF_FALLERS,
     description="hop forward on one leg with unknown masses",
     obs_names=(
@@ -206,7 +212,8 @@ class Hopper(Robot):
     | reset | nominal + U(±0.005) |
     | end | after 500 steps |
     | step | 4 × 0.002 s, RK4 |
-    | options | `observe_average_velocity=False`: the released code's 11 numbers |
+    | options | `scale_inertia`: the mass scale applies to the rotational inertia too; |
+    | | `observe_average_velocity=False`: the released code's 11 numbers |
 
     Source: supplement A.1 and released `hopper_env.py`; entry 11 is ours, since the reward
     cannot be told from the other 11.
@@ -236,6 +243,9 @@ class SlimHumanoidTask(Task):
     obs_size, action_size = 45, 17
     action_low, action_high = (-0.4,) * 17, (0.4,) * 17
 
+    scale_inertia: bool = False
+    """Apply the mass scale to the rotational inertia too."""
+
     def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """Forward velocity before the step, effort, and a bonus for standing after it."""
         height = next_obs[..., 0]
@@ -258,6 +268,7 @@ SLIM_HUMANOID = EnvSpec(
     sim_params=_mass_sets((0.8, 0.9, 1.0, 1.15, 1.25), (0.6, 0.7), (1.5, 1.6)),
     episode_length=1000,
     default_sim_params={"mass_scale": 1.0, "damping_scale": 1.0},
+    options={"scale_inertia": False},
     quick=QUICK_OF_FALLERS,
     description="walk upright as a humanoid with unknown masses",
     obs_names=(
@@ -283,6 +294,7 @@ class SlimHumanoid(Robot):
     | reset | nominal + U(±0.01), quaternion normalised |
     | end | after 1000 steps |
     | step | 5 × 0.003 s, RK4 |
+    | options | `scale_inertia`: the mass scale applies to the rotational inertia too |
 
     Source: supplement A.1 and released `slim_humanoid_env.py`.
     """
@@ -318,6 +330,9 @@ class HalfCheetahTask(Task):
     obs_size, action_size = 18, 6
     action_low, action_high = (-1.0,) * 6, (1.0,) * 6
 
+    scale_inertia: bool = False
+    """Apply the mass scale to the rotational inertia too."""
+
     def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """Forward velocity over the step, and the effort."""
         del obs
@@ -349,6 +364,7 @@ HALF_CHEETAH = EnvSpec(
     sim_params=_mass_sets((0.25, 0.5, 1.5, 2.5), (0.1, 0.15), (2.75, 3.0)),
     episode_length=1000,
     default_sim_params={"mass_scale": 1.0, "damping_scale": 1.0},
+    options={"scale_inertia": False},
     quick=QUICK,
     description="run forward on two legs with unknown masses",
     obs_names=(
@@ -373,6 +389,7 @@ class HalfCheetah(Robot):
     | reset | nominal + N(0, 0.001) |
     | end | after 1000 steps |
     | step | 5 × 0.01 s, Euler |
+    | options | `scale_inertia`: the mass scale applies to the rotational inertia too |
 
     Source: supplement A.1 and released `half_cheetah_env.py`.
     """
