@@ -42,7 +42,7 @@ CHANGED = Config(
     fitting=FittingConfig(oracle="independent", learning_rate=3e-4),
     planner=PlannerConfig(num_particles=4, optimizer=ICEMConfig(noise_beta=0.5)),
     collection=CollectionConfig(episode_length=20),
-    evaluation=EvaluationConfig(every=2),
+    evaluation=EvaluationConfig(training_group="always"),
 )
 ADAPTED = dataclasses.replace(CHANGED, model=GradientAdaptedConfig(adaptation_rate=0.5))
 

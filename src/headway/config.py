@@ -422,10 +422,11 @@ class EvaluationConfig:
     """Tests of controllers; test episodes have fixed seeds, the same for every method."""
 
     every: Count = 1
-    """Iterations between tests on the unseen groups; the last iteration is always tested, on the
-    training physics too."""
+    """Iterations between tests on the unseen groups; the last iteration is always tested."""
     num_episodes: Annotated[int, Field(strict=True, ge=1, le=1000)] = 10
     """Episodes per group, spread evenly over the group's simulator parameters."""
+    training_group: Literal["last", "always"] = "last"
+    """When the training physics are tested too: after the last iteration, or at every test."""
     seed: Annotated[int, Field(strict=True, ge=0, le=2**30)] = 10_000
     """Seed of the first test episode; the others follow it."""
     max_bad_episodes: CountOrNone = 0

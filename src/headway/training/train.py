@@ -201,12 +201,13 @@ class _Training:
 
     def groups(self) -> list[str]:
         """The groups that are tested after this iteration; often none."""
-        number = self.iteration + 1
+        evaluation, number = self.config.evaluation, self.iteration + 1
         last = number == self.config.collection.num_iterations
-        if self.environments is None or (not last and number % self.config.evaluation.every):
+        if self.environments is None or (not last and number % evaluation.every):
             return []
-        groups = self.environments.sim_params.group_names
-        return [*groups] if last else [*groups[1:]]
+        train, *unseen = self.environments.sim_params.group_names
+        with_train = last or evaluation.training_group == "always"
+        return [train, *unseen] if with_train else unseen
 
     def begin_phase(self, name: str, work: int) -> None:
         """Announce what comes next, and its environment steps or epochs."""
