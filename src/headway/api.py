@@ -110,8 +110,8 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
     if task is not None:
         if isinstance(env, EnvSpec) or sim_params is None:
             raise ConfigError(
-                "task is given without sim_params or with an EnvSpec, allowed: task and sim_params"
-                " with an id or what makes the environment; an EnvSpec has a Task."
+                "sim_params are missing, or task is given with an EnvSpec, allowed: sim_params and"
+                " perhaps task, with an id or what makes the environment; an EnvSpec has a Task."
             )
         make_task = (lambda: task) if isinstance(task, Task) else task
         env = EnvSpec(env_id=env, make_task=make_task, sim_params=sim_params)

@@ -252,7 +252,7 @@ def name_spec(env: Any) -> str:
         return env
     if not isinstance(env, EnvSpec):
         raise ConfigError(
-            f"env is {shown(env)}, allowed: a name, an EnvSpec, or with task=... what makes it."
+            f"env is {shown(env)}, allowed: a name, an EnvSpec, or what makes it with sim_params."
         )
     for name, module in list(sys.modules.items()):
         for key, value in list(getattr(module, "__dict__", {}).items()):

@@ -90,8 +90,9 @@ def test_a_spec_that_a_module_holds_is_named_so_that_any_process_finds_it(tmp_pa
     ("given", "says"),
     [
         ({"env": SPEC, "task": FallingTask}, "an EnvSpec has a Task"),
-        ({"env": Falling, "task": FallingTask}, "task is given without sim_params"),
-        ({"env": Falling}, "env is .*, allowed: a name, an EnvSpec, or with task"),
+        ({"env": Falling, "task": FallingTask}, "sim_params are missing, or task"),
+        ({"env": Falling}, "sim_params are missing, or task"),
+        ({"env": 3.0}, "env is 3.0, allowed: a name, an EnvSpec, or"),
         ({"env": Falling, "task": FallingTask, "sim_params": SIM_PARAMS}, "has episode_length 0"),
         ({"env": "Walker3d-v5", "task": FallingTask, "sim_params": SIM_PARAMS}, "Walker2d"),
         (

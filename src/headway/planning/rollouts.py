@@ -230,7 +230,8 @@ def plan_flop(
     sizes = (task.feature_size + task.action_size, *model.hidden_sizes)
     recurrent = model.kind == "recurrent"  # four gates per unit
     products = sum(4 * (n + m) * m if recurrent else n * m for n, m in itertools.pairwise(sizes))
-    per_step = 2.0 * (products + sizes[-1] * outputs * task.obs_size)
+    numbers = outputs * task.obs_size + 2 * model.learned_reward
+    per_step = 2.0 * (products + sizes[-1] * numbers)
     if evaluations is None:
         evaluations = make_optimizer(planner).max_evaluations
     return evaluations * planner.num_particles * planner.horizon * per_step
