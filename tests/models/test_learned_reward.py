@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -40,30 +41,34 @@ def test_a_rollout_earns_what_the_heads_predict_until_they_predict_an_end(known)
     net, statistics = known
     rng = np.random.default_rng(0)
     obs, candidates = rng.normal(size=(1, 2)), rng.uniform(-1, 1, (1, 30, 4, 2))
-    heads, context = np.array([[[1], [0]]]), rng.normal(size=(2, 1, 3)).astype(np.float32)
-    dynamics = fold(net.forward_net, statistics, Blank(), jnp.asarray(heads), jnp.asarray(context))
-    planner = PlannerConfig(num_particles=2, particle_noise="none")
-    found = candidate_returns(
-        dynamics,
+    heads, context = [1, 0], rng.normal(size=(2, 1, 3)).astype(np.float32)
+    learned = 0.1 * rng.normal(size=(1, 2, 2, 12, 2))  # by the last layer, of 8 + 3 + 1 features
+    dynamics = fold(
+        net.forward_net,
+        statistics,
         Blank(),
-        jnp.asarray(obs),
-        jnp.asarray(candidates),
-        planner=planner,
-        key=jax.random.key(0),
+        jnp.asarray(heads)[None, :, None],
+        jnp.asarray(context),
+        correction=jnp.asarray(learned),
     )
+    planner = PlannerConfig(num_particles=2, particle_noise="none")
+    args = dynamics, Blank(), jnp.asarray(obs), jnp.asarray(candidates)
+    found = candidate_returns(*args, planner=planner, key=jax.random.key(0))
     expected, ended = np.zeros(30), 0
     for member, candidate in np.ndindex(2, 30):
-        x, alive = obs[0].astype(np.float32), True
+        x, alive, head = obs[0].astype(np.float32), True, heads[member]
         for action in candidates[0, candidate]:
-            row = network_input(
-                Blank(), statistics, jnp.asarray(x[None]), jnp.asarray(action[None])
-            )
-            row, about = (jnp.broadcast_to(r, (2, 1, r.shape[-1])) for r in (row, context))
-            mean = np.asarray(toys.predict(net.forward_net, row, about).mean)
-            delta, reward, logit = np.split(mean[member, heads[0, member, 0], 0], [2, 3])
+            pair = jnp.asarray(x[None]), jnp.asarray(action[None])
+            row = network_input(Blank(), statistics, *pair)
+            row, about = (jnp.broadcast_to(r, (2, 1, r.shape[-1])).mT for r in (row, context))
+            features = net.forward_net.head_input(row, about)
+            mean = np.asarray(net.forward_net.predict(features).mean)[member, head, :, 0]
+            delta, reward, logit = np.split(mean, [2, 3])
+            seen = np.append(np.asarray(features)[member, :, 0], 1.0)
+            delta = jnp.asarray(delta + seen @ learned[0, member, head])
             expected[candidate] += alive * (3.0 + 2.0 * reward[0]) / 2
             alive, ended = alive and logit[0] <= 0, ended + (alive and logit[0] > 0)
-            x = x + np.asarray(statistics.delta.denormalize(jnp.asarray(delta)))
+            x = x + np.asarray(statistics.delta.denormalize(delta))
     assert 5 < ended < 55  # both happen
     np.testing.assert_allclose(found[0], expected, rtol=2e-4, atol=2e-4)
 
@@ -72,11 +77,9 @@ def test_heads_are_chosen_and_corrected_by_observations_alone(known):
     net, statistics = known
     planner = dataclasses.replace(toys.TINY, num_particles=2)
     agent = toys.make_agent(net, planner, statistics=statistics, task=Blank())
-    other = jax.tree.map(lambda x: x, net)
-    heads = other.forward_net.mean_heads
-    moved = dataclasses.replace(heads, bias=heads.bias.at[..., 2:].add(9.0))
-    other = dataclasses.replace(
-        other, forward_net=dataclasses.replace(other.forward_net, mean_heads=moved)
+    biases = net.forward_net.mean_heads.bias
+    other = eqx.tree_at(
+        lambda net: net.forward_net.mean_heads.bias, net, biases.at[..., 2:].add(9.0)
     )
     same = toys.make_agent(other, planner, statistics=statistics, task=Blank())
     obs, action = np.random.default_rng(2).normal(size=(2, 5, 2)).astype(np.float32)

@@ -164,7 +164,7 @@ def _chosen(
     heads: Int[Array, "env member choice"],
     context: Context,
     correction: Float[Array, "env member head feature obs"] | None = None,
-) -> tuple[Float[Array, "env member choice hidden obs"], Float[Array, "env member choice obs"]]:
+) -> tuple[Float[Array, "env member choice hidden out"], Float[Array, "env member choice out"]]:
     """Weights and biases of the chosen heads, the context added to the biases."""
     member = jnp.arange(heads.shape[1])[:, None]
     weight, bias = layer.weight[member, heads], layer.bias[member, heads]
