@@ -40,7 +40,7 @@ def test_readme_python(tmp_path, monkeypatch, capsys):
 @pytest.fixture(scope="module")
 def guide(tmp_path_factory):
     """What the guide to own environments defines, its run small; its folder is the current one."""
-    (package,) = python_blocks("docs/own-environment.md")
+    package, learned = python_blocks("docs/own-environment.md")
     names: dict = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(task, "_registered", dict(task._registered))
@@ -49,13 +49,16 @@ def guide(tmp_path_factory):
         module = types.ModuleType("my_package")
         vars(module).update(names)
         patch.setitem(sys.modules, "my_package", module)
+        exec(learned.replace("quick", "smoke"), names)
+        names["learned"] = names["run"]
         names["run"] = headway.train("my_package:cart", preset="smoke", run_dir="runs/cart")
         yield names
 
 
 def test_own_environment_guide(guide):
-    run = guide["run"]
-    assert {row.group for row in run.evaluation} == {"train", "heavy"}
+    for run, learned in ((guide["run"], False), (guide["learned"], True)):
+        assert {row.group for row in run.evaluation} == {"train", "heavy"}
+        assert run.config.model.learned_reward is learned
     obs = np.array([0.5, 0.0], np.float32)
     task = headway.env_spec("my_package:cart").make_task()
     assert jnp.isclose(task.reward(obs, jnp.array([1.0]), jnp.array([0.5, 0.1])), -0.26)
