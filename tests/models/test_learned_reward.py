@@ -19,6 +19,7 @@ from headway.models.folding import fold
 from headway.models.statistics import Normalizer, network_input
 from headway.planning.rollouts import candidate_returns
 from headway.training.check import check
+from headway.training.progress import make_progress
 
 LEARNED = dataclasses.replace(toys.SMALL, learned_reward=True)
 PHYSICS = {"train": {"push": [0.5, 1.0]}}
@@ -111,15 +112,23 @@ class Pushed(gymnasium.Env):
         return self.state.copy(), reward, bool(np.abs(self.state[0]) > 2), False, {}
 
 
-def test_an_environment_alone_is_enough_and_its_reward_and_end_are_learned(tmp_path, monkeypatch):
+def test_an_environment_alone_is_enough_and_its_reward_and_end_are_learned(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(task, "_registered", {})
     settings = {"collection.episode_length": 25, "collection.num_episodes": 40}
     settings |= {"model.num_heads": 1, "fitting.min_updates": 1500, "fitting.batch_size": 128}
     settings |= {"model.hidden_sizes": (32, 32), "model.history_length": 2}
     settings |= {"planner.selection_length": 2, "collection.min_steps": 600}
     run = headway.train(
-        Pushed, sim_params=PHYSICS, preset="smoke", run_dir=tmp_path / "run", settings=settings
+        Pushed,
+        sim_params=PHYSICS,
+        preset="smoke",
+        run_dir=tmp_path / "run",
+        settings=settings,
+        progress=make_progress(quiet=False),
     )
+    assert "reward and end of episodes are learned" in capsys.readouterr().err
     assert run.config.model.learned_reward
     agent = run.controller().agent
     belief = agent.model.init_belief(1)

@@ -103,6 +103,8 @@ def train_run(
             run.begin(config)
             for remark in log.remarks if log else ():
                 shown.message(remark)
+            if config.model.learned_reward:
+                shown.message("reward and end of episodes are learned, not the Task's")
             _Training(config, run, environments, shown, stop, on_iteration, log).train()
     return run
 
