@@ -8,7 +8,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from headway.config import BUILT_IN_KINDS, TOLERANCE, Config, known_settings, override
+from headway.config import TOLERANCE, Config, MultiHeadedConfig, known_settings, override
 from headway.errors import ConfigError, check_names
 from headway.task import (
     BUILT_IN,
@@ -314,7 +314,7 @@ def make_config(
     config = override(config, {"seed": seed, **(settings or {})})
     env_options(config)  # refuses unknown ones
     if config.model.learns and not task_of(config).has_reward:
-        if config.model.kind in BUILT_IN_KINDS[1:]:
+        if not isinstance(config.model, MultiHeadedConfig):
             raise ConfigError(
                 f"the Task of {config.env} has no reward, and {method} learns none, allowed: a"
                 " method with a multi-headed model, as tmcl; or write the reward."
