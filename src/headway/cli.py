@@ -781,9 +781,7 @@ class PlotDynamics(Command):
 
     env: EnvName = tyro.MISSING
     """Short name or id of an environment; `headway list envs` shows them."""
-    output: Annotated[
-        Path | None, tyro.conf.arg(aliases=["-o"]), _unless_given("ENV-dynamics.png")
-    ] = None
+    output: Output = Path("dynamics.png")
     """The PNG file to write."""
     num_states: int = 100
     """States of the trajectory that are drawn."""
@@ -792,17 +790,14 @@ class PlotDynamics(Command):
 
     def run(self, words):
         """Draw, and print where the figure is."""
-        if self.num_states < 1:
-            raise ConfigError(f"--num-states is {self.num_states}, allowed: at least 1.")
         from headway.lab import dynamics
         from headway.task import env_spec
         from headway.training.files import check_target
 
-        name = env_spec(self.env).name
-        out = self.output or Path(f"{name}-dynamics.png")
-        check_target(out)
-        path = dynamics.plot_dynamics(name, out, num_states=self.num_states, seed=self.seed)
-        return self.show({"env": name, "figure": str(path)}, str(path))
+        check_target(self.output)
+        env, options = env_spec(self.env).name, {"num_states": self.num_states, "seed": self.seed}
+        path = str(dynamics.plot_dynamics(env, self.output, **options))
+        return self.show({"env": env, "figure": path}, path)
 
 
 def parse(words: Sequence[str]) -> Command:

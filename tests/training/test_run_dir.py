@@ -119,7 +119,7 @@ def test_what_is_read_is_what_was_written(root):
     ]
     assert len(run.load_data()) == 4
     assert sum(len(t) for t in run.load_data()) == run.metrics()[-1]["timesteps"]
-    assert {row["iteration"] for row in run.assignments() + run.prediction_errors()} == {0, 1}
+    assert {row["iteration"] for row in run.assignments()} == {0, 1}
 
 
 def test_rows_of_an_unfinished_iteration_do_not_count(root, reference):

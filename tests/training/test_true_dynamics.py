@@ -1,5 +1,9 @@
 """The simulator as a model: it imagines what the environments do, and nothing else."""
 
+import dataclasses
+from pathlib import Path
+
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,15 +11,17 @@ import pytest
 
 import headway
 from headway.envs.built_in import ClassicVectorEnv
+from headway.envs.physics import try_out
 from headway.errors import ConfigError
 from headway.lab.figures import save_run_figures
-from headway.models.simulator import ClassicSimulator, RobotSimulator
+from headway.models.simulator import ClassicSimulator, EnvSimulator
 from headway.planning.rollouts import candidate_returns
 from headway.task import env_action, env_spec
 from headway.training.collect import Environments
 from headway.training.methods import make_config
 from headway.training.trainers import make_trainer
 
+EXAMPLES = Path(__file__).parents[2] / "examples"
 CLASSIC = ["pendulum", "cartpole-swingup"]
 ROBOTS = ["hopper", "slim-humanoid", "half-cheetah", "crippled-ant"]
 SHORT = {"collection.episode_length": 6}
@@ -32,6 +38,7 @@ def begin(env, physics, *, steps=7):
     settings = {"collection.num_episodes": len(physics), **SMALL}
     config = make_config(env, method="true-dynamics", preset="smoke", settings=settings)
     environments = Environments.make(config)
+    config = dataclasses.replace(config, spaces=environments.task.spaces)
     columns = {name: np.array([values[name] for values in physics]) for name in physics[0]}
     environments.vector.reset(seed=[*range(len(physics))], options={"sim_params": columns})
     rng = np.random.default_rng(3)
@@ -80,7 +87,7 @@ def agent_of(config, environments):
 def simulator_of(config, environments):
     """The model that plans in some environments, and what it believes of them."""
     model = agent_of(config, environments).model
-    assert isinstance(model, ClassicSimulator | RobotSimulator)
+    assert isinstance(model, ClassicSimulator | EnvSimulator)
     return model, model.init_belief(environments.vector.num_envs)
 
 
@@ -123,6 +130,37 @@ def test_imagined_returns_of_robots_are_what_the_environment_pays_to_the_bit(env
     np.testing.assert_array_equal(found, again)
     np.testing.assert_allclose(found[:, 1], paid, rtol=1e-6)
     assert np.abs(found[:, 0] - paid).min() > 1e-4
+
+
+@pytest.mark.parametrize("module", ["cartpole", "drone", "walker"])
+def test_imagined_returns_of_own_environments_are_what_they_pay(module, monkeypatch):
+    """Numbers in Python, copied, and MuJoCo's data, put back; discrete and continuous actions."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    config, environments = begin(f"{module}:spec", [{}, {}], steps=4)
+    simulator, _ = simulator_of(config, environments)
+    shape = (2, 3, 6, environments.task.action_size)
+    candidates = np.random.default_rng(1).uniform(-1, 1, shape).astype(np.float32)
+    found, again = simulator.returns(candidates), simulator.returns(candidates)
+    paid = play(environments, candidates[:, 1])
+    np.testing.assert_array_equal(found, again)
+    np.testing.assert_allclose(found[:, 1], paid, rtol=1e-6)
+
+
+def test_what_was_tried_does_not_bring_the_time_limit_of_mujoco_nearer():
+    env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=20)
+    env.reset(seed=0)
+    assert try_out(env, np.zeros((3, 8, 1), np.float32)) == [8.0, 8.0, 8.0]
+    ends = [any(env.step(np.zeros(1, np.float32))[2:4]) for _ in range(20)]
+    assert ends == [False] * 19 + [True]
+
+
+def test_an_environment_that_cannot_be_copied_is_refused():
+    class Uncopied(gymnasium.Wrapper):
+        def __deepcopy__(self, memo):
+            raise TypeError("it holds a socket")
+
+    with pytest.raises(ConfigError, match=r"cannot be copied .*holds a socket.*, allowed:"):
+        try_out(Uncopied(gymnasium.make("CartPole-v1")), [[0]])
 
 
 def test_a_robot_that_mujoco_gives_up_on_ranks_last():

@@ -210,14 +210,14 @@ class RobotVectorEnv(WorldVectorEnv):
         datas = [mujoco.MjData(model) for _ in range(threads)]
         return model, datas, mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0)
 
-    def roll_out(
+    def try_out(
         self, i: int, actions: Float[np.ndarray, "candidate horizon action"]
-    ) -> tuple[RobotState, RobotState]:
-        """Return the states before and after every step, [candidate, horizon, ...].
+    ) -> Float[np.ndarray, " candidate"]:
+        """Return the sums of rewards that sequences would earn from where an environment is.
 
         The environments themselves are not touched. A future repeats what they will do to the
         bit: same physics, same constraint solver's warm start. Where MuJoCo gives up on a
-        sequence, its states are NaN.
+        sequence, its sum is NaN.
 
         Args:
             i: The environment to start from.
@@ -225,6 +225,7 @@ class RobotVectorEnv(WorldVectorEnv):
         """
         world, data, sim_params = self.world, self.datas[i], self.physics(i)
         model, datas, rollout = self._rollout
+        actions = actions.astype(np.float64)
         world.set_physics(model, sim_params)
         count, skip, nq, nv = len(actions), world.frame_skip, model.nq, model.nv
         full_physics = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
@@ -249,7 +250,8 @@ class RobotVectorEnv(WorldVectorEnv):
         after = world.after_step(qpos[:, :-1], qpos[:, 1:], qvel[:, 1:])
         now = np.full((count, 1), self.velocity[i])
         velocity = np.concatenate([now, after.velocity[:, :-1]], axis=1)
-        return RobotState(qpos[:, :-1], qvel[:, :-1], velocity), after
+        before = RobotState(qpos[:, :-1], qvel[:, :-1], velocity)
+        return world.reward(before, actions, after).sum(-1)
 
     def frame(self, i: int) -> np.ndarray:
         """Draw the robot.

@@ -5,7 +5,7 @@
 
 import copy
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -153,12 +153,55 @@ def adapted(make: Callable[..., Any], sim_params: SimParamSets | None, /, **keyw
     env = make(**keywords)
     if not isinstance(env, gymnasium.Env):
         return env  # refused where it is used
-    space, layers = env.observation_space, [env]
-    while isinstance(layers[-1], gymnasium.Wrapper):
-        layers.append(layers[-1].env)
-    packages = {type(layer).__module__.partition(".")[0] for layer in layers}
+    space = env.observation_space
+    packages = {type(layer).__module__.partition(".")[0] for layer in _layers(env)}
     if len(space.shape or ()) != 1 and space.dtype != np.uint8 and space.is_np_flattenable:
         env = gymnasium.wrappers.FlattenObservation(env)
     if packages <= {"gymnasium", "shimmy"} and find_model(env) is not None:
         env = MujocoPhysics(env, sim_params)
     return env
+
+
+def _layers(env: gymnasium.Env) -> list[gymnasium.Env]:
+    """The wrappers, from the outside in, and what they wrap."""
+    return [env, *(_layers(env.env) if isinstance(env, gymnasium.Wrapper) else [])]
+
+
+def try_out(env: gymnasium.Env, sequences: Sequence[Any]) -> list[float]:
+    """Sums of rewards that sequences of actions would earn; the environment stays where it is.
+
+    Every sequence has a copy of it; copies of MuJoCo's model are not sound, so there the data and
+    the attributes of all layers are put back instead.
+
+    Args:
+        env: The environment, some steps into an episode.
+        sequences: Actions as `env.step` takes them. An episode that terminates earns no more.
+
+    Raises:
+        ConfigError: It cannot be copied.
+    """
+    model, attributes = find_model(env), [(vars(one), dict(vars(one))) for one in _layers(env)]
+    try:
+        tried = [copy.deepcopy(env) if model is None else env for _ in sequences]
+        data = None if model is None else env.get_wrapper_attr("data")
+        start = copy.copy(data)
+    except Exception as error:  # whatever its parts raise
+        raise ConfigError(
+            f"{env} cannot be copied to try actions out ({error}), allowed: what copy.deepcopy"
+            " takes, and Gymnasium's MuJoCo environments; choose another method than true-dynamics."
+        ) from error
+    found = []
+    for one, actions in zip(tried, sequences, strict=True):
+        found.append(0.0)
+        for action in actions:
+            _, reward, terminated, _, _ = one.step(action)
+            found[-1] += float(reward)
+            if terminated:
+                break
+        if model is not None:
+            import mujoco
+
+            mujoco.mj_copyData(data, model, start)
+            for now, before in attributes:
+                now.update(before)
+    return found

@@ -24,6 +24,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv
 from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 
+from headway.envs.physics import try_out
 from headway.errors import (
     BadEnvironmentError,
     BrokenEpisodeError,
@@ -396,6 +397,11 @@ class SequentialVectorEnv(HeadwayVectorEnv):
     def observe(self) -> np.ndarray:
         """Stack what the environments returned last."""
         return np.stack(self._obs)
+
+    def try_out(self, i: int, actions: Any) -> np.ndarray:
+        """Return the sums of rewards that sequences would earn in environment `i` (`physics`)."""
+        over = self._ends[:, i].any()
+        return np.zeros(len(actions)) if over else np.array(try_out(self.envs[i], actions))
 
     def render(self) -> tuple[Any, ...]:
         """Draw all that do not break meanwhile, as they were told when they were made."""

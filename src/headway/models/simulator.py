@@ -18,7 +18,7 @@ from headway.models.base import Dynamics, Keys, Model, Transition, over_rows
 from headway.task import Task, env_action
 
 if TYPE_CHECKING:
-    from headway.envs.built_in import ClassicVectorEnv, RobotVectorEnv
+    from headway.envs.built_in import ClassicVectorEnv
 
 
 class Physics(NamedTuple):
@@ -82,29 +82,26 @@ class ClassicDynamics(Dynamics):
         return after, over_rows(lambda state: self.world.observe(state, jnp))(after)
 
 
-class RobotSimulator(Model):
-    """MuJoCo, which JAX cannot trace; it rolls out whole candidates from where its robots are."""
+class EnvSimulator(Model):
+    """Environments that JAX cannot trace; they try whole candidates from where they are."""
 
-    vector: "RobotVectorEnv" = eqx.field(static=True)
-    """The environments that are acted in."""
+    vector: Any = eqx.field(static=True)
+    """The environments that are acted in; `try_out` gives returns."""
     task: Task
     traceable = False
 
-    def dynamics(self, belief: tuple[()], precision: Precision = "float32") -> "RobotSimulator":
+    def dynamics(self, belief: tuple[()], precision: Precision = "float32") -> "EnvSimulator":
         """Itself."""
         return self
 
     def returns(
         self, candidates: Float[Array | np.ndarray, "env candidate horizon action"]
     ) -> Float[np.ndarray, "env candidate"]:
-        """Sums of rewards; not finite where MuJoCo gives up on a candidate.
+        """Sums of rewards; not finite where a simulator gives up on a candidate.
 
         Args:
             candidates: Action sequences in [-1, 1].
         """
-        actions = env_action(self.task, np.asarray(candidates)).astype(np.float64)
-        found = []
-        for i, sequences in enumerate(actions):
-            before, after = self.vector.roll_out(i, sequences)
-            found.append(self.vector.world.reward(before, sequences, after).sum(-1))
+        actions = env_action(self.task, np.asarray(candidates))
+        found = [self.vector.try_out(i, sequences) for i, sequences in enumerate(actions)]
         return np.stack(found).astype(np.float32)

@@ -341,10 +341,6 @@ class RunDir:
         """Share of segments that each head owns, per iteration, member and physics."""
         return self._rows("assignments.csv")
 
-    def prediction_errors(self) -> list[dict[str, Any]]:
-        """Error by imagined step, per iteration and group."""
-        return self._rows("prediction_error.csv")
-
     def load_checkpoint(self, template: Tree, iteration: Iteration = None) -> Tree:
         """Read what was learned up to an iteration.
 

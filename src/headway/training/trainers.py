@@ -342,25 +342,20 @@ class SimulatorTrainer(Trainer):
         """See `Trainer.model`.
 
         Raises:
-            ConfigError: No environments are given, or their simulator cannot be planned with.
+            ConfigError: No environments are given.
         """
         if self.environments is None:
             raise ConfigError(
                 "a run on the true dynamics has no controller of its own, allowed: testing it in"
                 " its simulator; use `headway evaluate`."
             )
-        from headway.envs.built_in import ClassicVectorEnv, RobotVectorEnv
-        from headway.models.simulator import ClassicSimulator, RobotSimulator
+        from headway.envs.built_in import ClassicVectorEnv
+        from headway.models.simulator import ClassicSimulator, EnvSimulator
 
         vector = self.environments.vector
         if isinstance(vector, ClassicVectorEnv):
             return ClassicSimulator(vector, self.task)
-        if isinstance(vector, RobotVectorEnv):
-            return RobotSimulator(vector, self.task)
-        raise ConfigError(
-            f"{self.config.env} has no simulator to plan with, allowed: the built-in"
-            " environments; choose another method than true-dynamics."
-        )
+        return EnvSimulator(vector, self.task)
 
 
 TRAINERS: dict[str, type[Trainer]] = {
