@@ -795,9 +795,9 @@ class PlotDynamics(Command):
         from headway.training.files import check_target
 
         check_target(self.output)
-        env, options = env_spec(self.env).name, {"num_states": self.num_states, "seed": self.seed}
-        path = str(dynamics.plot_dynamics(env, self.output, **options))
-        return self.show({"env": env, "figure": path}, path)
+        options = {"num_states": self.num_states, "seed": self.seed}
+        path = str(dynamics.plot_dynamics(self.env, self.output, **options))
+        return self.show({"env": env_spec(self.env).name, "figure": path}, path)
 
 
 def parse(words: Sequence[str]) -> Command:

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 import jax
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -119,7 +120,8 @@ def test_what_is_read_is_what_was_written(root):
     ]
     assert len(run.load_data()) == 4
     assert sum(len(t) for t in run.load_data()) == run.metrics()[-1]["timesteps"]
-    assert {row["iteration"] for row in run.assignments()} == {0, 1}
+    errors = pd.read_csv(root / "prediction_error.csv")
+    assert {row["iteration"] for row in run.assignments()} | {*errors.iteration} == {0, 1}
 
 
 def test_rows_of_an_unfinished_iteration_do_not_count(root, reference):

@@ -103,5 +103,4 @@ class EnvSimulator(Model):
             candidates: Action sequences in [-1, 1].
         """
         actions = env_action(self.task, np.asarray(candidates))
-        found = [self.vector.try_out(i, sequences) for i, sequences in enumerate(actions)]
-        return np.stack(found).astype(np.float32)
+        return np.array([self.vector.try_out(i, own) for i, own in enumerate(actions)], np.float32)
