@@ -21,7 +21,7 @@ FIRST_PLAN = Path(__file__).parent / "first_plan.py"
 def test_plan(num_envs, precision, timed, report):
     planner = planners()[precision]
     agent, state, obs = make_agent(num_envs, planner=planner)
-    flop = num_envs * plan_flop(MultiHeadedConfig(), planner, agent.task)
+    flop = num_envs * plan_flop(MultiHeadedConfig(), planner, agent.task, 5 * 200.0)
     timing = timed(lambda: agent.act(state, obs), rounds=7 if num_envs == 1 else 3)
     report.add(
         f"plan, {num_envs} env, {precision}",

@@ -30,7 +30,6 @@ LEARNING = {"planner.adaptation": "last-layer", "planner.change_threshold": 20.0
 WITH_HEADS = ("tmcl", "mcl", "pets", "mh-pets", "vanilla", "stacked", "cadm", "pets-cadm", "ria")
 PLANNERS = {
     "icem": {"planner.optimizer.name": "icem", "planner.optimizer.noise_beta": 0.25},
-    "mppi": {"planner.optimizer.name": "mppi"},
     "random-shooting": {"planner.optimizer.name": "random-shooting"},
     "bfloat16": {"planner.precision": "bfloat16"},
 }

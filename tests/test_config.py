@@ -15,7 +15,6 @@ from headway.config import (
     FittingConfig,
     GradientAdaptedConfig,
     ICEMConfig,
-    MPPIConfig,
     MultiHeadedConfig,
     PlannerConfig,
     RandomShootingConfig,
@@ -96,9 +95,7 @@ def test_another_optimizer_keeps_the_settings_that_both_have():
     few = override(DEFAULT, {"planner.optimizer.num_elites": 7, "planner.optimizer.smoothing": 0.3})
     icem = override(few, {"planner.optimizer.name": "icem", "planner.optimizer.noise_beta": 1})
     assert icem.planner.optimizer == ICEMConfig(num_elites=7, smoothing=0.3, noise_beta=1.0)
-    mppi = override(icem, {"planner.optimizer.name": "mppi"})
-    assert mppi.planner.optimizer == MPPIConfig(noise_beta=1.0)
-    shooting = override(mppi, {"planner.optimizer.name": "random-shooting"})
+    shooting = override(icem, {"planner.optimizer.name": "random-shooting"})
     assert shooting.planner.optimizer == RandomShootingConfig()
     again = override(shooting, {"planner.optimizer.name": "cem"})
     assert again.planner.optimizer == CEMConfig()
@@ -119,7 +116,7 @@ def test_another_kind_of_model_keeps_the_settings_that_both_have():
         ("sed", "Did you mean 'seed'?"),
         ("planner.num_elites", "Did you mean 'planner.optimizer.num_elites'?"),
         ("planner.optimizer", "Did you mean 'planner.optimizer.name'?"),
-        ("planner.optimizer.temperature", "a setting of planner.optimizer.name mppi only"),
+        ("planner.optimizer.action_cost", "a setting of planner.optimizer.name ilqr only"),
         ("model.adaptation_rate", "a setting of model.kind gradient-adapted only"),
     ],
 )
@@ -141,7 +138,11 @@ def test_a_setting_that_does_not_exist_is_refused_with_the_closest(wrong, said):
         ("planner.horizon", 0, "greater than or equal to 1"),
         ("planner.horizon", 10**30, "less than or equal to"),
         ("planner.optimizer.smoothing", 1.5, "less than or equal to 1"),
-        ("planner.optimizer.name", "icm", "Did you mean 'icem'? Allowed: cem, icem, mppi, random"),
+        (
+            "planner.optimizer.name",
+            "icm",
+            "Did you mean 'icem'? Allowed: cem, icem, random-shooting, ilqr",
+        ),
         ("planner.num_particles", 7, "a multiple of model.num_members (5), or 1 without"),
         ("model.num_heads", -1, "greater than or equal to 1"),
         ("model.kind", "unheard", "Allowed: multi-headed, gradient-adapted, recurrent, "),

@@ -117,9 +117,9 @@ def test_predictions_meet_what_happens_until_it_is_pushed(pendulum):
 
 def test_the_planner_changes_while_it_plays(pendulum):
     pendulum.reset(0)
-    pendulum.switch({"planner.optimizer.name": "mppi", **LEARNING})
+    pendulum.switch({"planner.optimizer.name": "ilqr", **LEARNING})
     pendulum.step()
-    assert pendulum.controller.agent.planner.optimizer.name == "mppi"
+    assert pendulum.controller.agent.planner.optimizer.name == "ilqr"
     assert len(pendulum.moments) == 1
     with pytest.raises(ConfigError, match="optimizer"):
         pendulum.switch({"planner.optimizer.name": "luck"})

@@ -456,9 +456,6 @@ class Diagnose(_OfRun):
     """Groups of physics: `train` or unseen groups."""
     episodes: Annotated[int | None, _unless_given("the run's own tests, not run again")] = None
     """Run tests with so many episodes per group."""
-    collected: Flag = False
-    """Take the episodes that the last iteration collected: training physics only, and the model has
-    learned from them since."""
 
     def run(self, words):
         """Diagnose, and print tables."""
@@ -468,7 +465,6 @@ class Diagnose(_OfRun):
             self.run_dir,
             groups=self.group or None,
             num_episodes=self.episodes,
-            collected=self.collected,
             settings=self.settings(),
             progress=self.progress(),
         )

@@ -277,7 +277,7 @@ class CEMConfig(OptimizerConfig):
     """The cross-entropy method (supplement A.2)."""
 
     name: Literal["cem"] = "cem"
-    """cem, icem, mppi or random-shooting; another one has other settings."""
+    """cem, icem, random-shooting or ilqr; another one has other settings."""
     num_elites: Count = 50
     """Best candidates that shape the next iteration."""
     smoothing: Share = 0.1
@@ -294,7 +294,7 @@ class ICEMConfig(OptimizerConfig):
     """The cross-entropy method with coloured noise and memory (Pinneri et al., 2020)."""
 
     name: Literal["icem"] = "icem"
-    """cem, icem, mppi or random-shooting; another one has other settings."""
+    """cem, icem, random-shooting or ilqr; another one has other settings."""
     num_elites: Count = 10
     """Best candidates that shape the next iteration."""
     smoothing: Share = 0.1
@@ -311,30 +311,25 @@ class ICEMConfig(OptimizerConfig):
 
 
 @settings
-class MPPIConfig(OptimizerConfig):
-    """Model-predictive path integral control (Williams et al., 2017)."""
-
-    name: Literal["mppi"] = "mppi"
-    """cem, icem, mppi or random-shooting; another one has other settings."""
-    initial_std: Std = 0.5
-    """Standard deviation of all candidates, actions being scaled to [-1, 1]."""
-    noise_beta: Beta = 2.0
-    """Exponent of the noise's power spectrum over the horizon: 0 white, 1 pink, 2 red; smoother
-    for slow systems."""
-    temperature: Positive = 0.5
-    """Softness of the weights exp(return / temperature), the returns of an iteration being
-    standardised: less looks at the best candidates only."""
-
-
-@settings
 class RandomShootingConfig(OptimizerConfig):
     """The best of uniformly random candidates, new ones in each iteration."""
 
     name: Literal["random-shooting"] = "random-shooting"
-    """cem, icem, mppi or random-shooting; another one has other settings."""
+    """cem, icem, random-shooting or ilqr; another one has other settings."""
 
 
-_SEARCHES = CEMConfig, ICEMConfig, MPPIConfig, RandomShootingConfig
+@settings
+class ILQRConfig(OptimizerConfig):
+    """The iterative linear-quadratic regulator, for unstable machines (Li and Todorov, 2004)."""
+
+    name: Literal["ilqr"] = "ilqr"
+    """cem, icem, random-shooting or ilqr; another one has other settings."""
+    action_cost: Positive = 0.01
+    """Cost of an action's square, scaled to [-1, 1], beside what the reward says: more is calmer.
+    """
+
+
+_SEARCHES = CEMConfig, ICEMConfig, RandomShootingConfig, ILQRConfig
 OPTIMIZERS: dict[str, type[OptimizerConfig]] = {search.name: search for search in _SEARCHES}
 
 
@@ -486,6 +481,12 @@ class Config:
         if planner.adaptation != "none" and model.kind in BUILT_IN_KINDS[1:]:
             allowed = f"none with a model of kind {model.kind}, which has no heads"
             raise _refused(self, "planner.adaptation", allowed)
+        continuous = self.spaces is None or self.spaces.action_kind == "box"
+        own_reward = planner.reward == "task" and not model.learned_reward
+        fit = own_reward and continuous and model.kind not in ("recurrent", "simulator")
+        if planner.optimizer.name == "ilqr" and not fit:
+            allowed = "another search, or the Task's own reward, continuous actions, and a model"
+            raise _refused(self, "planner.optimizer.name", f"{allowed} without inner state")
         if self.fitting.precision != "float32" and model.relation_head:
             allowed = "float32 with a relation head, whose losses are most of a fit"
             raise _refused(self, "fitting.precision", allowed)

@@ -37,16 +37,11 @@ def test_diagnose_runs_the_tests_of_a_run(reference, capsys):
         assert "Calibration of the predicted variance" in shown[mime]
 
 
-def test_diagnose_collected_episodes_and_what_is_refused(reference, capsys):
-    assert main(["diagnose", str(reference), "--collected"]) == 0
+def test_the_tables_of_a_diagnosis_and_what_is_refused(reference, capsys):
+    assert main(["diagnose", str(reference)]) == 0
     out = capsys.readouterr().out
     for title in ("Head selection", "Error of each head", "Calibration of the predicted variance"):
         assert title in out
-    assert "training physics, while collecting" in out
-    found = headway.diagnose(reference, collected=True)
-    assert [len(e.errors) for e in found.episodes["collected"]] == [11, 11]
-    with pytest.raises(ConfigError, match="collected"):
-        headway.diagnose(reference, collected=True, groups=["low"])
     for words, said in (("--group lo", "Did you mean 'low'?"), ("--episodes 0", "episodes is 0")):
         assert main(["diagnose", str(reference), *words.split(), "--quiet"]) == 1
         assert said in capsys.readouterr().err
@@ -57,7 +52,6 @@ def test_diagnose_collected_episodes_and_what_is_refused(reference, capsys):
     [
         ("random", [], "a run of random, which has no prediction heads"),
         ("tmcl", [], "has no finished iteration yet"),
-        ("tmcl", ["--collected"], "has no finished iteration yet"),
         (None, [], "config.json is missing"),
     ],
 )

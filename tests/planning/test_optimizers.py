@@ -8,10 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from headway.config import CEMConfig, ICEMConfig, MPPIConfig, PlannerConfig, RandomShootingConfig
-from headway.planning.optimizers import CEM, ICEM, MPPI, RandomShooting, make_optimizer
+from headway.config import CEMConfig, ICEMConfig, ILQRConfig, PlannerConfig, RandomShootingConfig
+from headway.planning.optimizers import CEM, ICEM, RandomShooting, make_optimizer
 from headway.planning.optimizers.base import colored_noise
-from headway.planning.optimizers.mppi import softmax_weights
 
 NUM_ENVS, HORIZON, ACTIONS, ROUNDS = 2, 4, 2, 3
 KEY = jax.random.key(0)
@@ -19,10 +18,9 @@ AIMS = [0.9, -0.2]
 OPTIMIZERS = [
     CEM(40, ROUNDS, 8, smoothing=0.2, initial_std=0.3),
     ICEM(40, ROUNDS, 8, smoothing=0.2, initial_std=0.4),
-    MPPI(40, ROUNDS, initial_std=0.4, temperature=0.6),
     RandomShooting(40, ROUNDS),
 ]
-SMALL_CEM, SMALL_ICEM, SMALL_MPPI, _ = OPTIMIZERS
+SMALL_CEM, SMALL_ICEM, _ = OPTIMIZERS
 
 
 @pytest.fixture(params=OPTIMIZERS, ids=lambda optimizer: type(optimizer).__name__)
@@ -92,7 +90,6 @@ def test_plans_and_candidates_stay_within_bounds_and_shape(optimizer, start):
         assert candidates.shape[2:] == (HORIZON, ACTIONS)
         assert np.abs(candidates).max() <= 1.0 + 1e-6
     np.testing.assert_array_equal(found.evaluations, sum(x.shape[1] for x in seen))
-    assert optimizer.max_evaluations == sum(x.shape[1] for x in seen)
 
 
 def test_a_plan_at_a_bound_leaves_it_when_what_is_best_has_changed(optimizer):
@@ -152,8 +149,8 @@ def test_a_shifted_search_starts_from_the_nominal_plan_one_step_later(optimizer)
     [
         CEMConfig(num_elites=3, smoothing=0.3, initial_std=0.4),
         ICEMConfig(num_elites=3, noise_beta=1.5, population_decay=1.1, kept_elite_fraction=0.7),
-        MPPIConfig(initial_std=0.4, noise_beta=1.5, temperature=0.7),
         RandomShootingConfig(),
+        ILQRConfig(action_cost=0.3),
     ],
     ids=str,
 )
@@ -226,24 +223,6 @@ def test_icem_equals_its_numpy_twin(beta):
     np.testing.assert_allclose(found.nominal, mean, atol=1e-5)
 
 
-@pytest.mark.parametrize("beta", [0.0, 2.0])
-def test_mppi_equals_its_numpy_twin(beta):
-    mppi, mean = dataclasses.replace(SMALL_MPPI, noise_beta=beta), np.float64(plan_of(0.1))
-    found, _ = watch(mppi, towards(AIMS), begin(mppi, 0.1))
-    for key in ask_keys(mppi):
-        shape = (NUM_ENVS, mppi.num_candidates, HORIZON, ACTIONS)
-        noise = np.float64(colored_noise(key, shape, beta))
-        candidates = np.clip(mean[:, None] + mppi.initial_std * noise, -1, 1)
-        returns = numpy_returns(candidates)
-        above = returns - np.median(returns, axis=1, keepdims=True)
-        better_half = np.sort(above, axis=1)[:, mppi.num_candidates // 2 :]
-        unit = np.sqrt((better_half**2).mean(1, keepdims=True))
-        weights = np.exp(above / unit / mppi.temperature)
-        weights /= weights.sum(1, keepdims=True)
-        mean = np.einsum("ec,ecta->eta", weights, candidates)
-    np.testing.assert_allclose(found.actions, mean, atol=1e-5)
-
-
 def test_random_shooting_takes_the_best_candidate_of_all_rounds():
     found, seen = watch(OPTIMIZERS[-1], towards(AIMS), begin(OPTIMIZERS[-1]))
     best = best_of(np.concatenate(seen, axis=1), 1)[:, 0]
@@ -291,31 +270,7 @@ def test_each_iteration_of_icem_draws_fewer_but_never_less_than_twice_the_elites
     assert [candidates.shape[1] for candidates in seen] == [40, 32, 25 + 1]  # and the last mean
 
 
-def test_equal_returns_weigh_the_same_in_mppi_and_non_finite_ones_nothing():
-    low = -jnp.inf
-    odd = jnp.asarray([[2.0, 2.0, low], [low, low, low], [low, 5.0, low], [1e30, -1e30, 0.0]])
-    found = softmax_weights(odd, 0.5)
-    np.testing.assert_allclose(found[:3], [[0.5, 0.5, 0], [0, 0, 0], [0, 1, 0]], atol=1e-6)
-    assert np.isfinite(found).all()
-
-
-def test_how_bad_the_worst_candidate_is_changes_no_weight_in_mppi():
-    bad, worse = (softmax_weights(jnp.asarray([[low, 1.0, 2.0, 5.0]]), 0.5) for low in (-99, -1e6))
-    np.testing.assert_allclose(bad[0, 1:], worse[0, 1:], rtol=1e-4)
-    assert worse[0, 3] > 2 * worse[0, 2] > 4 * worse[0, 1] > 8 * worse[0, 0]
-
-
-@pytest.mark.parametrize("share", [0.4, 0.7])
-def test_many_very_bad_candidates_change_no_order_in_mppi(share):
-    returns = jax.random.normal(KEY, (1, 100)).at[:, : int(100 * share)].add(-1e6)
-    weights = softmax_weights(returns, 0.5)
-    assert (weights * jnp.maximum(returns, -5)).sum() > 0.7
-
-
-@pytest.mark.parametrize(
-    ("optimizer", "gap"), [(CEM(200, 8, 20), 0.05), (MPPI(200, 8), 0.15)], ids=["CEM", "MPPI"]
-)
-def test_it_beats_random_shooting_with_as_many_candidates_and_nears_the_optimum(optimizer, gap):
+def test_cem_beats_random_shooting_with_as_many_candidates_and_nears_the_optimum():
     """A linear-quadratic problem: x' = x + 0.3 u under -x² - 0.1 u²."""
     x0, gain, cost, steps = np.float32([[0.5, -0.4], [-0.3, 0.1], [0.2, 0.4]]), 0.3, 0.1, 10
 
@@ -332,7 +287,7 @@ def test_it_beats_random_shooting_with_as_many_candidates_and_nears_the_optimum(
         nothing = jnp.zeros_like(best)
         found, drawn = (
             one.optimize(score, begin(one, nothing), key=key).actions
-            for one in (optimizer, RandomShooting(200, 8))
+            for one in (CEM(200, 8, 20), RandomShooting(200, 8))
         )
         return score(jnp.stack([found, drawn, best, nothing], axis=1), None)
 
@@ -340,7 +295,7 @@ def test_it_beats_random_shooting_with_as_many_candidates_and_nears_the_optimum(
         found, drawn, optimum, idle = np.asarray(achieved(jax.random.key(key))).T
         assert (found > drawn).all()
         assert (found <= optimum + 1e-5).all()
-        assert ((optimum - found) < gap * (optimum - idle)).all()
+        assert ((optimum - found) < 0.05 * (optimum - idle)).all()
 
 
 @pytest.mark.parametrize("beta", [0.0, 0.5, 2.0])

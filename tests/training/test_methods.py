@@ -35,7 +35,8 @@ def test_fast_preset_plans_with_a_hundredth_of_the_papers_arithmetic_and_changes
 ):
     paper, fast = (make_config(env, method=method, preset=name) for name in ("paper", "fast"))
     task = env_spec(env).make_task()
-    costs = [plan_flop(config.model, config.planner, task) for config in (paper, fast)]
+    candidates = ((paper, 5 * 200.0), (fast, 100 + 80 + 64 + 3 * 3 + 1.0))  # and kept, and the mean
+    costs = [plan_flop(config.model, config.planner, task, n) for config, n in candidates]
     assert 100 * costs[1] <= costs[0]
     assert dataclasses.replace(fast, preset="paper", planner=paper.planner) == paper
 
@@ -69,8 +70,8 @@ def test_method_wins_over_preset_and_user_over_both():
 
 def test_a_test_may_change_only_settings_that_training_did_not_fix():
     config = make_config("pendulum", method="mcl")
-    changed = config_to_evaluate(config, {"planner.optimizer.name": "mppi", "evaluation.every": 2})
-    assert (changed.planner.optimizer.name, changed.evaluation.every) == ("mppi", 2)
+    changed = config_to_evaluate(config, {"planner.optimizer.name": "icem", "evaluation.every": 2})
+    assert (changed.planner.optimizer.name, changed.evaluation.every) == ("icem", 2)
     for name, sections in (
         ("model.num_heads", ("planner", "evaluation")),
         ("evaluation.every", ("planner",)),

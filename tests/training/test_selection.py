@@ -28,7 +28,7 @@ def by_hand(errors, chosen, deviations=None):
 def test_it_examines_what_the_acting_agent_decided():
     """The agent's own choices, step by step, and its heads' errors on what followed."""
     agent = make_agent(toys.small_model())
-    state = agent.init(1, key=jax.random.key(0))
+    state = agent.init(1, key=jax.random.key(3))
     obs, actions, heads = [np.float32([0.3, -0.2])], [], []
     for _ in range(9):
         state, decision = agent.act(state, obs[-1][None])

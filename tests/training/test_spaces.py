@@ -97,7 +97,7 @@ def test_actions_are_the_nearest_that_the_space_contains(space):
     assert np.bincount(nearest, minlength=len(every)).min() > 0.6 * len(draws) / len(every)
 
 
-@pytest.mark.parametrize("optimizer", ["cem", "icem", "mppi", "random-shooting"])
+@pytest.mark.parametrize("optimizer", ["cem", "icem", "random-shooting"])
 def test_every_optimizer_plans_the_best_category(optimizer):
     own = PushTask(told_spaces=read_spaces(OBS, Discrete(3)))
     planner = PlannerConfig({"name": optimizer}, horizon=2, num_particles=1)

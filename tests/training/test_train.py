@@ -104,7 +104,7 @@ def test_each_iteration_is_told_once_it_counts(tmp_path):
     [
         ({}, 2 * 8),
         ({"planner.num_candidates": 6}, 2 * 6),
-        ({"planner.optimizer.name": "mppi", "planner.num_iterations": 3}, 3 * 8),
+        ({"planner.optimizer.name": "random-shooting", "planner.num_iterations": 3}, 3 * 8),
     ],
 )
 def test_a_run_can_be_tested_with_another_planner(settings, evaluations, reference):

@@ -13,7 +13,7 @@ from rich.table import Table
 from headway.config import Config
 from headway.data import Trajectory
 from headway.errors import ConfigError
-from headway.lab.tables import COLLECTED, distinct, full_label, group_label, new_table, varying
+from headway.lab.tables import distinct, full_label, group_label, new_table, varying
 from headway.models.multi_headed import MultiHeadModel
 from headway.task import sim_param_sets
 from headway.training import selection
@@ -57,7 +57,6 @@ def diagnose(
     *,
     groups: Sequence[str] | None = None,
     num_episodes: int | None = None,
-    collected: bool = False,
     settings: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
@@ -71,8 +70,6 @@ def diagnose(
         run_dir: The run directory.
         groups: `"train"` or unseen groups; by default those that the run was tested with.
         num_episodes: Episodes per group to run tests with; by default those of the run are taken.
-        collected: Take the episodes that the last iteration collected instead. The model has
-            learned from these since.
         settings: Changes of `planner` settings by dotted name: how heads would be selected, and
             learn, in these same episodes. Actions stay as they were, but for tests that are run.
         progress: Shown while testing; silent by default.
@@ -81,8 +78,7 @@ def diagnose(
         RunError: There is no trained run, or it is damaged.
         UnknownNameError: No such group.
         ConfigError: A setting is unknown, of the wrong type or out of range, or one that training
-            has fixed; `collected` leaves no choice of groups and episodes; or the run's method
-            has no model with heads.
+            has fixed; or the run's method has no model with heads.
         LimitError: Planning needs more memory than is free.
     """
     run = RunDir(run_dir)
@@ -93,16 +89,7 @@ def diagnose(
             " methods with a multi-headed model, such as tmcl."
         )
     trajectories: Mapping[str, list[Trajectory]] = {}
-    if collected:
-        if groups or num_episodes is not None:
-            raise ConfigError(
-                "groups or episodes are chosen together with `collected`, allowed: one of them; the"
-                " collected episodes are all of training physics."
-            )
-        rounds = int(str((config.log or {}).get("rounds", 0)))
-        fits = run.last_iteration < rounds  # of recordings, all kept with the first iteration
-        trajectories = {COLLECTED: run.iteration_data(0 if fits else run.last_iteration)}
-    elif num_episodes is None and (kept := run.tests()):
+    if num_episodes is None and (kept := run.tests()):
         wanted = known_groups(groups, sim_param_sets(config).group_names) if groups else [*kept]
         if kept.keys() >= set(wanted):
             trajectories = {group: kept[group] for group in wanted}

@@ -26,6 +26,7 @@ from headway.data import History, where_env
 from headway.models.networks import PRECISIONS, Dense, rounded
 from headway.task import Task
 
+USUAL_WIDTH = 256
 Keys = Key[Array, "2"]
 """One draws heads at random, the other the noise of sampled errors."""
 
@@ -49,9 +50,13 @@ class Dynamics(eqx.Module):
 
     @property
     def widest(self) -> int:
-        """Numbers in the widest layer of one step; decides how much is imagined at once."""
+        """Numbers in the widest layer of one step; decides how much is imagined at once.
+
+        What has no layers counts as one of usual width.
+        """
         parts = jax.tree.leaves(self, is_leaf=lambda part: isinstance(part, Layer))
-        return max(part.bias.shape[-1] for part in parts if isinstance(part, Layer))
+        widths = (part.bias.shape[-1] for part in parts if isinstance(part, Layer))
+        return max(widths, default=USUAL_WIDTH)
 
     @property
     def num_members(self) -> int:
@@ -259,16 +264,14 @@ class FunctionModel(Model):
         parameters: The function's first argument: a pytree of arrays, such as a network's weights.
         predict: `predict(parameters, obs, action)`, pure and traceable by JAX, takes observations
             [..., obs] and actions [..., action] in [-1, 1] to the next observations.
-        widest: Numbers in its widest layer; decides how much is imagined at once.
     """
 
     parameters: Any
     predict: Callable[[Any, Array, Array], Array] = eqx.field(static=True)
-    widest: int = eqx.field(static=True, default=256)
 
     def dynamics(self, belief: tuple[()], precision: Precision = "float32") -> "FunctionDynamics":
         """The function; its precision is its own."""
-        return FunctionDynamics(belief, self.parameters, self.predict, self.widest)
+        return FunctionDynamics(belief, self.parameters, self.predict)
 
 
 class FunctionDynamics(Dynamics):
@@ -276,12 +279,6 @@ class FunctionDynamics(Dynamics):
 
     parameters: Any
     predict: Callable[[Any, Array, Array], Array] = eqx.field(static=True)
-    width: int = eqx.field(static=True)
-
-    @property
-    def widest(self) -> int:
-        """See `Dynamics.widest`."""
-        return self.width
 
     def step(self, carry, obs, action, noise):
         """See `Dynamics.step`."""

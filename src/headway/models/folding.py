@@ -83,12 +83,11 @@ class FoldedDynamics(Dynamics):
     ) -> tuple[Any, Float[Array, "member obs particle candidate"]]:
         """See `Dynamics.step`: a sample of the next delta, or its mean without noise."""
         heads, low, high, context_bias = self.own
-        activation = rough_swish if heads.weight.dtype == jnp.bfloat16 else swish
         x = jnp.concatenate([over_rows(self.task.preprocess)(obs), action], axis=1)
         for index, layer in enumerate(self.hidden):
             if index == self.context_layer and context_bias is not None:
                 layer = layer._replace(bias=context_bias)  # noqa: PLW2901
-            x = activation(layer(x))
+            x = swish(layer(x))
         out, obs_size = heads(x), obs.shape[1]
         delta, outcome, out = jnp.split(out, (obs_size, obs_size + self.outcomes), axis=1)
         if noise is not None and low is not None and high is not None:
@@ -186,17 +185,3 @@ def bounded_var(
 ) -> Float[Array, "..."]:
     """`exp(bound_logvar(...))`, in which all logarithms cancel: one exponential instead of five."""
     return jnp.exp(low) + 1.0 / (jnp.exp(-high) + jnp.exp(-logvar))
-
-
-def rough_swish(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """`swish` to within 2e-4, a tenth of what rounding to bfloat16 takes from a number near 1.
-
-    Its tanh is a quotient of polynomials of lower degree than XLA's, fitted to the least
-    largest error of swish.
-    """
-    half = 0.5 * x
-    bounded = jnp.clip(half, -5.4, 5.4)
-    square = jnp.square(bounded)
-    above = 0.998925793 + square * (0.098016076 + square * 5.71165459e-4)
-    below = 1.0 + square * (0.429472208 + square * 0.0116753473)
-    return half + half * (bounded * above / below)

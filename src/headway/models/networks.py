@@ -63,6 +63,7 @@ _reduced.defvjp(_forward, _backward)
 _sums = functools.partial(jnp.einsum, preferred_element_type=jnp.float32)
 
 
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def rounded(x: Float[Array, "*shape"], dtype: DTypeLike) -> Float[Array, "*shape"]:
     """`x` in a precision of `PRECISIONS`, to the nearest.
 
@@ -74,6 +75,11 @@ def rounded(x: Float[Array, "*shape"], dtype: DTypeLike) -> Float[Array, "*shape
         return x.astype(dtype)
     bits = jax.lax.bitcast_convert_type(x, jnp.uint32) + jnp.uint32(2**15)
     return jax.lax.bitcast_convert_type((bits >> 16).astype(jnp.uint16), jnp.bfloat16)
+
+
+@rounded.defjvp
+def _(dtype, values, changes):
+    return rounded(*values, dtype), changes[0].astype(dtype)
 
 
 def row_by_row(x: Float[Array, "member row column"]) -> Float[Array, "member row column"]:

@@ -62,11 +62,6 @@ class ClassicDynamics(Dynamics):
     task: Task
     world: Any = eqx.field(static=True)
 
-    @property
-    def widest(self) -> int:
-        """See `Dynamics.widest`."""
-        return self.world.state_size
-
     def start(self) -> Float[Array, "1 state"]:
         """See `Dynamics.start`."""
         return jnp.asarray(self.own.state)[None]

@@ -15,7 +15,7 @@ from headway.data import sim_params_row
 from headway.models.base import Model, Transition
 from headway.models.compilation import in_each_precision, jit_networks
 from headway.planning import cpu
-from headway.planning.optimizers import Optimizer, make_optimizer
+from headway.planning.optimizers import ILQR, Optimizer, make_optimizer
 from headway.planning.rollouts import candidate_returns, within_members
 from headway.task import Task
 
@@ -75,7 +75,7 @@ class Agent(eqx.Module):
     planner: PlannerConfig = eqx.field(static=True)
 
     @property
-    def optimizer(self) -> Optimizer:
+    def optimizer(self) -> Optimizer | ILQR:
         """The search for the best action sequence."""
         return make_optimizer(self.planner)
 
@@ -109,7 +109,8 @@ class Agent(eqx.Module):
             told = jnp.broadcast_to(np.stack(rows), (num_envs, len(names)))
         if self.model is not None:
             belief = self.model.init_belief(num_envs, told)
-            search = self.optimizer.init(num_envs, self.planner.horizon, action_size)
+            sizes = self.planner.horizon, action_size, self.task.obs_size
+            search = self.optimizer.init(num_envs, *sizes)
         obs = jnp.zeros((num_envs, self.task.obs_size))
         action = jnp.zeros((num_envs, action_size))
         return AgentState(belief, obs, action, jnp.zeros(num_envs, bool), search, key)
@@ -145,6 +146,9 @@ class Agent(eqx.Module):
         """The plan after another iteration: ask for candidates, score them, tell their returns."""
         assert self.model is not None
         optimizer, precision = self.optimizer, self.planner.precision
+        if isinstance(optimizer, ILQR):
+            args = optimizer, plan.dynamics, self.task, plan.obs, plan.search
+            return plan._replace(search=_improve[precision](*args))
         # Iterations of a kind are one program; which of them it is decides the key alone.
         which = plan.key, np.int32(iteration), iteration * optimizer.unrolled
         candidates, key = _ask(optimizer, self.task, plan.search, *which)
@@ -204,7 +208,12 @@ def step(
     agent: Agent, state: AgentState, obs: Float[Array, "env obs"]
 ) -> tuple[AgentState, Decision]:
     """A whole step as one program: observe, specialise, search, decide."""
-    plan = observe(agent, state, obs)
+    plan, optimizer = observe(agent, state, obs), agent.optimizer
+    if isinstance(optimizer, ILQR):
+        args = plan.dynamics, agent.task, obs
+        iterate = lambda _, search: optimizer.iterate(*args, search)  # noqa: E731
+        search = jax.lax.fori_loop(0, optimizer.num_iterations, iterate, plan.search)
+        return decide(agent, plan._replace(search=search))
 
     def score(candidates, key):
         args = plan.dynamics, agent.task, obs, candidates
@@ -212,11 +221,13 @@ def step(
         return within_members(returns, agent.planner, plan.dynamics.num_members)
 
     project = agent.task.project_action
-    search = agent.optimizer.optimize(score, plan.search, key=plan.key, project=project)
+    search = optimizer.optimize(score, plan.search, key=plan.key, project=project)
     return decide(agent, plan._replace(search=search))
 
 
-_step, _observe, _score = map(in_each_precision, (step, observe, candidate_returns))
+_step, _observe, _score, _improve = map(
+    in_each_precision, (step, observe, candidate_returns, ILQR.iterate)
+)
 _decide = jit_networks(decide)
 
 

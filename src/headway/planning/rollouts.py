@@ -12,7 +12,6 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from headway.config import ModelConfig, PlannerConfig
 from headway.models.base import Dynamics, over_rows
 from headway.planning import cpu
-from headway.planning.optimizers import make_optimizer
 from headway.task import Task
 
 
@@ -45,7 +44,7 @@ def candidate_returns(
         key: Draws the noise of the rollouts.
         shard: The environments or candidates whose returns are wanted, if not all.
     """
-    total, first_candidate = candidates.shape[1], 0
+    first_candidate = 0 if shard is None or shard.axis == 0 else shard.first
     keys = jax.vmap(functools.partial(jax.random.fold_in, key))(jnp.arange(len(obs)))
     args: tuple[Any, Array, Array, PRNGKeyArray] = (dynamics.own, obs, candidates, keys)
     if shard is not None:
@@ -53,7 +52,6 @@ def candidate_returns(
         if shard.axis == 0:
             args = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, **part), args)
         else:
-            first_candidate = shard.first
             own_candidates = jax.lax.dynamic_slice_in_dim(candidates, axis=1, **part)
             args = dynamics.own, obs, own_candidates, keys
     num_envs, num_candidates, horizon, _ = args[2].shape
@@ -66,23 +64,17 @@ def candidate_returns(
     # step that uses it. Elsewhere that would take too much memory.
     in_steps = jax.default_backend() != "cpu"
 
-    def roll_out(
-        some: Dynamics, first: Int[Array, ""], obs, candidates, key
-    ) -> Float[Array, "member particle candidate"]:
-        """The return of every rollout of some members of one environment, from `first` on."""
-        members, step_noise, draw = some.num_members, None, None
+    def drawn(key) -> Float[Array, "member obs particle candidate"]:
+        """One step's noise. Each candidate has a stream of its own, whoever imagines it."""
+        numbers = first_candidate + jnp.arange(num_candidates)
+        keys = jax.vmap(functools.partial(jax.random.fold_in, key))(numbers)
+        draw = functools.partial(jax.random.normal, shape=(ensemble, obs_size, particles))
+        return jax.vmap(draw, out_axes=-1)(keys)
 
-        def drawn(key) -> Float[Array, "member obs particle candidate"]:
-            """One step's noise: the block of these members and candidates of the noise of all."""
-            whole = ensemble, obs_size, particles, total
-            start, size = (first, 0, 0, first_candidate), (members, obs_size, particles)
-            return cpu.normal_block(key, whole, start, (*size, num_candidates))
-
-        if noisy:
-            keys = jax.random.split(key, horizon)
-            step_noise, draw = (keys, drawn) if in_steps else (jax.vmap(drawn)(keys), None)
-        noise = step_noise, draw
-        return rollout_returns(some, task, reward, obs, candidates, particles, noise)
+    def roll_out(some: Dynamics, obs, candidates, noise) -> Float[Array, "member particle cand"]:
+        """The return of every rollout of some members of one environment."""
+        draw = drawn if in_steps else None
+        return rollout_returns(some, task, reward, obs, candidates, particles, (noise, draw))
 
     bytes_per_env = 4 * dynamics.widest * planner.num_particles * num_candidates
     budget = cpu.activation_budget() if shard is None else cpu.CACHES_OF_CORE
@@ -90,19 +82,23 @@ def candidate_returns(
     in_turns = shard is not None and ensemble > 1 and not alone and bytes_per_env > budget
 
     def of_env(own, obs, candidates, key) -> Float[Array, " candidate"]:
-        one, none = dynamics.of_env(own), jnp.zeros((), jnp.int32)
+        one, noise = dynamics.of_env(own), None
+        if noisy:
+            keys = jax.random.split(key, horizon)
+            noise = keys if in_steps else jax.vmap(drawn)(keys)
         if alone:
             each = -(-num_candidates // ensemble)
             # Each member's candidates, by their place in the shard; the last ones may be past it.
             place = (jnp.arange(ensemble)[:, None] - first_candidate) % ensemble
             place = place + ensemble * jnp.arange(each)
-            returns = roll_out(one, none, obs, candidates.at[place].get(mode="clip"), key)
+            returns = roll_out(one, obs, candidates.at[place].get(mode="clip"), noise)
             return jnp.zeros(num_candidates).at[place].set(returns[:, 0], mode="drop")
         if not in_turns:
-            return roll_out(one, none, obs, candidates[None], key).mean((0, 1))
+            return roll_out(one, obs, candidates[None], noise).mean((0, 1))
 
         def of_member(member: Int[Array, ""]) -> Float[Array, "particle candidate"]:
-            return roll_out(one.of_member(member), member, obs, candidates[None], key)[0]
+            mine = noise if noise is None else noise[:, member][:, None]
+            return roll_out(one.of_member(member), obs, candidates[None], mine)[0]
 
         return jax.lax.map(of_member, jnp.arange(ensemble)).mean((0, 1))
 
@@ -208,9 +204,7 @@ def follow(
     return jax.vmap(of_env)(dynamics.own, obs, actions).transpose(2, 0, 1, 3)
 
 
-def plan_flop(
-    model: ModelConfig, planner: PlannerConfig, task: Task, evaluations: float | None = None
-) -> float:
+def plan_flop(model: ModelConfig, planner: PlannerConfig, task: Task, evaluations: float) -> float:
     """Floating-point operations of the matrix products of one environment's plan.
 
     The imagined rollouts are counted. Left out is what happens once per step, encoding the
@@ -220,7 +214,7 @@ def plan_flop(
         model: Settings of the networks.
         planner: Settings of the planner.
         task: The sizes of observations and actions.
-        evaluations: Candidates that were scored; by default as many as the search may score.
+        evaluations: Candidates that were scored.
     """
     if not model.learns:
         return 0.0
@@ -232,6 +226,6 @@ def plan_flop(
     products = sum(4 * (n + m) * m if recurrent else n * m for n, m in itertools.pairwise(sizes))
     numbers = outputs * task.obs_size + 2 * model.learned_reward
     per_step = 2.0 * (products + sizes[-1] * numbers)
-    if evaluations is None:
-        evaluations = make_optimizer(planner).max_evaluations
-    return evaluations * planner.num_particles * planner.horizon * per_step
+    mean = planner.optimizer.name == "ilqr"
+    particles = model.num_members if mean else planner.num_particles
+    return evaluations * particles * planner.horizon * per_step

@@ -210,7 +210,6 @@ def _quick(spec: EnvSpec) -> Settings:
         "evaluation.every": 5,
         "evaluation.num_episodes": 8,
         "collection.min_steps": 0 if spec.name in BUILT_IN else min(1000, full),
-        **spec.quick,
     }
 
 
@@ -310,6 +309,7 @@ def make_config(
     chosen = METHODS[method]
     config = Config(env=spec.name, method=method, preset=preset)
     config = override(config, PRESETS[preset].settings(spec))
+    config = override(config, spec.quick if preset == "quick" else {})
     config = override(config, {**chosen.settings, **chosen.by_preset.get(preset, {})})
     config = override(config, {"seed": seed, **(settings or {})})
     env_options(config)  # refuses unknown ones

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation
 
 from headway.sim_params import SimParamSets
 from headway.task import Action, EnvSpec, Obs, Reward, Task
@@ -502,13 +503,9 @@ class CrippledAnt(Robot):
 
     def observe(self, state: RobotState) -> np.ndarray:
         """Return positions, velocities, the torso's rotation matrix and its position."""
-        w, x, y, z = np.moveaxis(state.qpos[..., 3:7], -1, 0)
-        rows = (
-            (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
-            (2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)),
-            (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
-        )
-        rotation = np.stack([entry for row in rows for entry in row], axis=-1)
+        quaternions = state.qpos[..., 3:7].reshape(-1, 4)
+        rotation = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
+        rotation = rotation.reshape(*state.qpos.shape[:-1], 9)
         return np.concatenate([state.qpos, state.qvel, rotation, state.qpos[..., :3]], axis=-1)
 
 

@@ -10,18 +10,18 @@ from headway.planning.optimizers.base import Score as Score
 from headway.planning.optimizers.base import Search as Search
 from headway.planning.optimizers.cem import CEM as CEM
 from headway.planning.optimizers.icem import ICEM as ICEM
-from headway.planning.optimizers.mppi import MPPI as MPPI
+from headway.planning.optimizers.ilqr import ILQR as ILQR
 from headway.planning.optimizers.random_shooting import RandomShooting as RandomShooting
 
-_OPTIMIZERS: dict[str, type[Optimizer]] = {
+_OPTIMIZERS: dict[str, type[Optimizer] | type[ILQR]] = {
     "cem": CEM,
     "icem": ICEM,
-    "mppi": MPPI,
     "random-shooting": RandomShooting,
+    "ilqr": ILQR,
 }
 
 
-def make_optimizer(config: PlannerConfig) -> Optimizer:
+def make_optimizer(config: PlannerConfig) -> Optimizer | ILQR:
     """Build the optimizer that the settings name."""
     own = {name: value for name, value in vars(config.optimizer).items() if name != "name"}
     return _OPTIMIZERS[config.optimizer.name](

@@ -51,12 +51,7 @@ class Optimizer(eqx.Module):
     unrolled: ClassVar[bool] = False
     """Iterations differ in shape, so that each is compiled by itself."""
 
-    @property
-    def max_evaluations(self) -> int:
-        """Candidates scored for one environment's plan; fewer where it is cut off."""
-        return self.num_candidates * self.num_iterations
-
-    def init(self, num_envs: int, horizon: int, action_size: int) -> Search:
+    def init(self, num_envs: int, horizon: int, action_size: int, obs_size: int = 0) -> Search:
         """The start of a search that knows nothing: actions of zero."""
         none = jnp.zeros(num_envs, jnp.int32)
         nominal = jnp.zeros((num_envs, horizon, action_size))
@@ -130,20 +125,17 @@ def shift_steps(
     return jnp.concatenate([values[..., 1:, :], appended], axis=-2)
 
 
-def rank_non_finite_last(
-    returns: Float[Array, "env candidate"],
-) -> Float[Array, "env candidate"]:
-    """Turn every non-finite return into -inf, so that it ranks last."""
-    return jnp.where(jnp.isfinite(returns), returns, -jnp.inf)
-
-
 def best_candidates(
     candidates: Float[Array, "env candidate horizon action"],
     returns: Float[Array, "env candidate"],
     count: int,
 ) -> tuple[Float[Array, "env elite horizon action"], Float[Array, "env elite"]]:
-    """The candidates of the highest returns, and these returns, best first."""
-    elite_returns, elite = jax.lax.top_k(rank_non_finite_last(returns), count)
+    """The candidates of the highest returns, and these returns, best first.
+
+    What is not finite counts as -inf.
+    """
+    ranked = jnp.where(jnp.isfinite(returns), returns, -jnp.inf)
+    elite_returns, elite = jax.lax.top_k(ranked, count)
     return jnp.take_along_axis(candidates, elite[:, :, None, None], axis=1), elite_returns
 
 

@@ -40,12 +40,7 @@ class ICEM(Optimizer):
         """Elites that compete once more."""
         return round(self.kept_elite_fraction * self.num_elites)
 
-    @property
-    def max_evaluations(self) -> int:
-        """See `Optimizer.max_evaluations`; kept elites and the final mean are scored too."""
-        return sum(self.populations) + self.num_kept * self.num_iterations + 1
-
-    def init(self, num_envs, horizon, action_size):
+    def init(self, num_envs, horizon, action_size, obs_size=0):
         """See `Optimizer.init`; all elites are still to be drawn."""
         search = super().init(num_envs, horizon, action_size)
         return search._replace(best=search.nominal)
