@@ -194,7 +194,8 @@ def planners(path: Path, figure: Path | None, reference: Path | None) -> None:
     cost = table.pivot_table(values="network_evaluations_per_step", **by)
     random, paper = means["random actions"], means["paper"]
     share = means.sub(random, axis=0).div(paper - random, axis=0)
-    markdown((means.round().astype(int).astype(str) + " (" + share.map("{:.0%}".format) + ")").T)
+    shown = means.map("{:.0f}".format) + " (" + share.map("{:.0%}".format) + ")"
+    markdown(shown.where(means.notna(), "–").T)
     if figure is None:
         return
     envs = list(dict.fromkeys(table.env))

@@ -49,7 +49,7 @@ PLANNERS: dict[str, dict[str, Any]] = {
     "iCEM, means": search("icem", 100, 3, 20, 5, num_elites=10, **SPREAD),
     "iCEM, means, 40 × 2": search("icem", 40, 2, 15, 5, num_elites=5, **SPREAD),
     "iCEM, means, one member": search("icem", 100, 3, 20, 1, num_elites=10, **SPREAD),
-    "MPPI, means, one member": search("mppi", 100, 3, 20, 1, **SPREAD),
+    "iLQR, means": search("ilqr", 8, 3, 20, 5),
     "random shooting, means, one member": search("random-shooting", 300, 1, 15, 1),
 }
 

@@ -247,7 +247,7 @@ def test_what_a_terminal_cannot_show_is_escaped(monkeypatch):
 
 def test_plot_dynamics(capsys, tmp_path):
     out_file = tmp_path / "deep" / "picture.png"
-    words = ("plot-dynamics", "pendulum", "-o", str(out_file), "--num-states", "5", "--json")
+    words = ("plot-dynamics", "pendulum", "-o", str(out_file), "--json")
     code, out, _ = run(capsys, *words)
     assert code == 0
     assert json.loads(out) == {"env": "pendulum", "figure": str(out_file)}

@@ -779,10 +779,6 @@ class PlotDynamics(Command):
     """Short name or id of an environment; `headway list envs` shows them."""
     output: Output = Path("dynamics.png")
     """The PNG file to write."""
-    num_states: int = 100
-    """States of the trajectory that are drawn."""
-    seed: int = 0
-    """Seeds the trajectory and its random actions."""
 
     def run(self, words):
         """Draw, and print where the figure is."""
@@ -791,8 +787,7 @@ class PlotDynamics(Command):
         from headway.training.files import check_target
 
         check_target(self.output)
-        options = {"num_states": self.num_states, "seed": self.seed}
-        path = str(dynamics.plot_dynamics(self.env, self.output, **options))
+        path = str(dynamics.plot_dynamics(self.env, self.output))
         return self.show({"env": env_spec(self.env).name, "figure": path}, path)
 
 

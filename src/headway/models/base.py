@@ -26,7 +26,6 @@ from headway.data import History, where_env
 from headway.models.networks import PRECISIONS, Dense, rounded
 from headway.task import Task
 
-USUAL_WIDTH = 256
 Keys = Key[Array, "2"]
 """One draws heads at random, the other the noise of sampled errors."""
 
@@ -56,7 +55,7 @@ class Dynamics(eqx.Module):
         """
         parts = jax.tree.leaves(self, is_leaf=lambda part: isinstance(part, Layer))
         widths = (part.bias.shape[-1] for part in parts if isinstance(part, Layer))
-        return max(widths, default=USUAL_WIDTH)
+        return max(widths, default=256)
 
     @property
     def num_members(self) -> int:

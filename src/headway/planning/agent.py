@@ -197,7 +197,7 @@ def observe(agent: Agent, state: AgentState, obs: Float[Array, "env obs"]) -> Pl
 def decide(agent: Agent, plan: Plan) -> tuple[AgentState, Decision]:
     """Take a plan's first action; where its search ended, one step later, is the next start."""
     search, acted = plan.search, jnp.ones(len(plan.obs), bool)
-    action, start = search.actions[:, 0], agent.shift(search)
+    action, start = search.answer(plan.obs), agent.shift(search)
     action = agent.task.project_action(action)
     state = AgentState(plan.belief, plan.obs, action, acted, start, plan.next_key)
     heads = getattr(plan.belief, "heads", None)

@@ -310,8 +310,8 @@ def make_config(
     config = Config(env=spec.name, method=method, preset=preset)
     config = override(config, PRESETS[preset].settings(spec))
     config = override(config, spec.quick if preset == "quick" else {})
-    config = override(config, {**chosen.settings, **chosen.by_preset.get(preset, {})})
-    config = override(config, {"seed": seed, **(settings or {})})
+    own = {**chosen.settings, **chosen.by_preset.get(preset, {}), "seed": seed}
+    config = override(config, {**own, **(settings or {})})  # together: each may need the other
     env_options(config)  # refuses unknown ones
     if config.model.learns and not task_of(config).has_reward:
         if not isinstance(config.model, MultiHeadedConfig):

@@ -1,4 +1,4 @@
-"""Optimizers of action sequences. They know nothing of models: a score function is all.
+"""Optimizers of action sequences. All but `ILQR` know nothing of models: a score is enough.
 
 Each is a set of hyperparameters with pure methods. Actions are scaled to [-1, 1].
 Environments are independent; they are searched side by side.
@@ -13,12 +13,7 @@ from headway.planning.optimizers.icem import ICEM as ICEM
 from headway.planning.optimizers.ilqr import ILQR as ILQR
 from headway.planning.optimizers.random_shooting import RandomShooting as RandomShooting
 
-_OPTIMIZERS: dict[str, type[Optimizer] | type[ILQR]] = {
-    "cem": CEM,
-    "icem": ICEM,
-    "random-shooting": RandomShooting,
-    "ilqr": ILQR,
-}
+_OPTIMIZERS = {"cem": CEM, "icem": ICEM, "random-shooting": RandomShooting, "ilqr": ILQR}
 
 
 def make_optimizer(config: PlannerConfig) -> Optimizer | ILQR:

@@ -39,6 +39,10 @@ class Search(NamedTuple):
         """The plan, within [-1, 1]."""
         return jnp.clip(self.nominal if self.best is None else self.best, -1.0, 1.0)
 
+    def answer(self, obs: Float[Array, "env obs"]) -> Float[Array, "env action"]:
+        """The first action of the plan."""
+        return self.actions[:, 0]
+
 
 class Optimizer(eqx.Module):
     """Searches for the action sequence of the highest return: ask for candidates, tell returns."""

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from headway.data import where_env
+from headway.errors import ConfigError
 from headway.models.base import Dynamics
 from headway.task import Task
 
@@ -24,10 +25,10 @@ class Policy(NamedTuple):
     evaluations: Int[Array, " env"]
     """Plans that were imagined; a slope by one number costs as much as one."""
 
-    @property
-    def actions(self) -> Float[Array, "env horizon action"]:
-        """The nominal actions, within [-1, 1]."""
-        return self.nominal
+    def answer(self, obs: Float[Array, "env obs"]) -> Float[Array, "env action"]:
+        """The action of the first step, also where the environment is not where it should be."""
+        away = obs - self.expected[:, 0]
+        return jnp.clip(self.nominal[:, 0] + jnp.einsum("eao,eo->ea", self.gain[:, 0], away), -1, 1)
 
 
 class ILQR(eqx.Module):
@@ -61,7 +62,7 @@ class ILQR(eqx.Module):
         """The policy of every environment after another iteration."""
         each = jax.vmap(lambda own, *given: self.improve(dynamics.of_env(own), task, *given))
         nominal, expected, gain, paid = each(dynamics.own, obs, *policy[:3])
-        tried = 1 + self.num_candidates + sum(policy.gain.shape[2:])
+        tried = 3 + self.num_candidates + sum(policy.gain.shape[2:])  # once more for each slope
         policy = policy._replace(evaluations=policy.evaluations + tried)
         found = policy._replace(nominal=nominal, expected=expected, gain=gain)
         failed = policy._replace(non_finite=policy.non_finite + 1)
@@ -77,6 +78,11 @@ class ILQR(eqx.Module):
         gain: Float[Array, "horizon action obs"],
     ) -> tuple[Array, Array, Array, Float[Array, ""]]:
         """The next policy of one environment, and the return that it promises."""
+        if jax.tree.leaves(dynamics.start()):
+            raise ConfigError(
+                "planner.optimizer.name is 'ilqr', allowed with this model, which carries a state"
+                " or learns the reward: another search."
+            )
 
         def step(obs, action):
             members = jnp.ones((dynamics.num_members, 1, 1, 1))
@@ -102,7 +108,7 @@ class ILQR(eqx.Module):
 
         _, visited, actions = way = follow(nominal, expected, gain)[1:]
         change, gain = best_change(*jax.vmap(functools.partial(expand, step, reward))(*way))
-        shares = jnp.linspace(1.0, 0.0, self.num_candidates) ** 3  # mostly small ones
+        shares = jnp.linspace(1.0, 0.0, self.num_candidates + 1) ** 3  # mostly small, and none
         tried = jax.vmap(lambda share: follow(actions + share * change, visited, gain))
         paid, _, ways, plans = tried(shares)
         best = jnp.argmax(jnp.where(jnp.isfinite(paid), paid, -jnp.inf))
@@ -119,6 +125,7 @@ def expand(
     """
     both, size = jnp.concatenate([obs, action]), obs.size
     slopes = jax.jacfwd(lambda both: step(both[:size], both[size:]))(both)
+    slopes = jnp.where(alive, slopes, jnp.eye(size, both.size))  # nothing moves after the end
 
     def earned(change):
         moved = both + change
