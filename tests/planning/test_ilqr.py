@@ -1,5 +1,6 @@
 """The iterative linear-quadratic regulator: the exact solution, unstable machines, its refusals."""
 
+import dataclasses
 from typing import ClassVar
 
 import jax
@@ -8,9 +9,11 @@ import numpy as np
 import pytest
 
 import headway
+import headway.envs
 import toys
 from headway.config import Config, ILQRConfig, PlannerConfig, override
 from headway.errors import ConfigError
+from headway.models.simulator import ClassicSimulator
 from headway.planning.agent import Agent
 from headway.planning.controller import Controller
 from headway.spaces import Spaces
@@ -88,18 +91,59 @@ def test_an_unstable_machine_is_held_against_disturbances():
         assert (np.abs(obs) < 0.5).all()
 
 
-def test_what_comes_after_the_end_counts_nothing():
+class GreedyTask(BalanceTask):
     """Every step pays more farther to the right, and nothing more beyond 1."""
 
-    class GreedyTask(BalanceTask):
-        obs_size: ClassVar[int] = 1
+    obs_size: ClassVar[int] = 1
 
-        def reward(self, obs, action, next_obs):
-            return 1.0 + 0.1 * next_obs[..., 0]
+    def reward(self, obs, action, next_obs):
+        return 1.0 + 0.1 * next_obs[..., 0]
 
+
+def test_what_comes_after_the_end_counts_nothing():
     agent = agent_of(lambda _, obs, action: obs + 0.2 * action, GreedyTask(), 11, 4, ILQRConfig())
     policy = plans(agent, np.zeros((1, 1)))
     assert 0.7 < policy.expected.max() <= 1.0
+
+
+@pytest.mark.parametrize("num_candidates", [1, 8])
+def test_a_fall_that_is_imagined_first_does_not_hide_the_way_to_stay_up(num_candidates):
+    class EdgeTask(GreedyTask):
+        def reward(self, obs, action, next_obs):
+            return 1.0 - 0.1 * jnp.square(next_obs[..., 0])
+
+    agent = agent_of(
+        lambda _, obs, action: 1.5 * obs + 0.1 * action,
+        EdgeTask(),
+        num_candidates,
+        3,
+        ILQRConfig(),
+        horizon=30,
+    )
+    state, obs = agent.init(1, key=jax.random.key(0)), np.float32([[0.05]])
+    for _ in range(10):
+        state, decision = agent.act(state, obs)
+        obs = np.asarray(1.5 * obs + 0.05 * agent.task.scale_action(decision.action))
+    assert np.abs(obs).max() < 0.02
+    assert np.abs(state.search.expected).max() < 0.1
+
+
+def test_a_plan_without_time_to_search_answers_the_observation():
+    agent = agent_of(linear, toys.PointTask(), num_iterations=3)
+    state, _ = agent.act(agent.init(2, key=jax.random.key(0)), START)
+    expected, surprise = state.search.expected[:, 0], np.float32([0.02, -0.05])
+    _, decision = agent.end(agent.begin(state, expected + surprise))
+    gain = np.float64(riccati()[-2])  # of the second step
+    np.testing.assert_allclose(decision.action, (expected + surprise) @ gain.T, atol=1e-4)
+
+
+def test_a_model_that_carries_a_state_is_refused():
+    planner = dataclasses.replace(PlannerConfig(ILQRConfig()), num_particles=1)
+    vector = headway.envs.make_vec("pendulum", 1)
+    task = headway.env_spec("pendulum").make_task()
+    agent = Agent(ClassicSimulator(vector, task), task, planner)
+    with pytest.raises(ConfigError, match="which carries a state"):
+        agent.act(agent.init(1, key=jax.random.key(0)), np.zeros((1, 3)))
 
 
 def test_an_environment_without_finite_returns_keeps_its_plan_and_counts_failures():
@@ -109,7 +153,8 @@ def test_an_environment_without_finite_returns_keeps_its_plan_and_counts_failure
     np.testing.assert_array_equal(decision.failures, [1, 0])
     np.testing.assert_array_equal(decision.action[0], 0.0)
     assert (decision.action[1] != 0).any()
-    np.testing.assert_array_equal(decision.evaluations, 7 + 4)  # and a slope by each number
+    # The last plan and its steps' slopes, by each number; six candidates, and no change.
+    np.testing.assert_array_equal(decision.evaluations, 1 + 1 + 4 + 6 + 1)
 
 
 def test_a_plan_in_parts_and_one_that_is_bfloat16_agree_with_the_whole():

@@ -31,7 +31,8 @@ class AgentState(NamedTuple):
     acted: Bool[Array, " env"]
     """Environments in which that action, taken at `obs`, led to the next observation."""
     search: Any
-    """The last search as it ended, one step later (`Search`); None for a random agent."""
+    """The last search as it ended, one step later (`Search`, or iLQR's `Policy`); None for a random
+    agent."""
     key: PRNGKeyArray
 
 
