@@ -113,7 +113,6 @@ def test_wrong_usage_exits_2_and_says_what_there_is(capsys, calls, words, text):
         ("train hopper --env-options scale-inertia", "allowed: NAME=VALUE"),
         ("train pendulum --sim-params missing.json", "missing.json"),
         ("evaluate nowhere --json", "allowed: a run directory"),
-        ("plot-dynamics pendulum --num-states 0", "num_states is 0, allowed: "),
         (
             "evaluate RUN --sim-params length=1 length=2",
             "--sim-params is length=1 length=2, allowed",
