@@ -43,7 +43,7 @@ spec = headway.EnvSpec(
         },
     ),
     quick={
-        "collection.num_iterations": 5,
+        "collection.num_iterations": 6,
         "collection.num_episodes": 10,
         "collection.min_steps": 500,
         "fitting.epochs": 1,
@@ -52,7 +52,7 @@ spec = headway.EnvSpec(
         "planner.horizon": 30,
         "planner.num_candidates": 8,
         "planner.num_iterations": 2,
-        "evaluation.every": 5,
+        "evaluation.every": 6,
         "evaluation.num_episodes": 10,
     },
 )
