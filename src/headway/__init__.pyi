@@ -29,6 +29,7 @@ from .planning.agent import Agent as Agent
 from .planning.controller import Controller as Controller
 from .planning.optimizers import CEM as CEM
 from .planning.optimizers import ICEM as ICEM
+from .planning.optimizers import ILQR as ILQR
 from .planning.optimizers import RandomShooting as RandomShooting
 from .service.export import export as export
 from .service.serve import serve as serve

@@ -15,7 +15,6 @@ from typing import Any, ClassVar, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.spatial.transform import Rotation
 
 from headway.sim_params import SimParamSets
 from headway.task import Action, EnvSpec, Obs, Reward, Task
@@ -503,6 +502,8 @@ class CrippledAnt(Robot):
 
     def observe(self, state: RobotState) -> np.ndarray:
         """Return positions, velocities, the torso's rotation matrix and its position."""
+        from scipy.spatial.transform import Rotation  # a quarter of a second, for this robot only
+
         quaternions = state.qpos[..., 3:7].reshape(-1, 4)
         rotation = Rotation.from_quat(quaternions, scalar_first=True).as_matrix()
         rotation = rotation.reshape(*state.qpos.shape[:-1], 9)
