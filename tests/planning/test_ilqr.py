@@ -16,6 +16,7 @@ from headway.errors import ConfigError
 from headway.models.simulator import ClassicSimulator
 from headway.planning.agent import Agent
 from headway.planning.controller import Controller
+from headway.planning.rollouts import follow
 from headway.spaces import Spaces
 
 HORIZON, COST = 12, 0.3
@@ -171,6 +172,17 @@ def test_a_plan_in_parts_and_one_that_is_bfloat16_agree_with_the_whole():
         action = whole.act(obs)
         np.testing.assert_allclose(parts.act(obs), action, atol=1e-5)
         np.testing.assert_allclose(rough.act(obs), action, atol=0.05)
+
+
+def test_a_plan_with_feedback_expects_what_the_members_predict_together():
+    agent = toys.make_agent(toys.small_model(), optimizer=ILQRConfig(), horizon=6, num_iterations=2)
+    controller, obs = Controller(agent), np.float32([0.3, -0.2])
+    action = agent.task.unscale_action(jnp.asarray(controller.act(obs))[None, None])
+    dynamics = agent.model.dynamics(controller._state.belief, "float32")
+    each = follow(dynamics, jnp.asarray(obs)[None], action)
+    (expected,) = controller.imagine()
+    assert each.shape[0] > 1
+    np.testing.assert_allclose(expected[0], each[:, 0, 0].mean(0), atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float
 
 from headway import envs
-from headway.errors import BadEnvironmentError, ConfigError
+from headway.errors import BadEnvironmentError
 from headway.lab.figures import INK, figure, numbers
 from headway.lab.tables import Physics, full_label, varying
 from headway.task import EnvSpec, env_spec
 
 
-def plot_dynamics(env: str, out: str | Path, *, num_states: int = 100, seed: int = 0) -> Path:
+def plot_dynamics(env: str, out: str | Path) -> Path:
     """Draw what a trajectory's actions lead to under each training physics.
 
     A trajectory of random actions is collected in the default environment; in each of its
@@ -24,29 +24,24 @@ def plot_dynamics(env: str, out: str | Path, *, num_states: int = 100, seed: int
     Args:
         env: Short name or id of an environment.
         out: The PNG file to write.
-        num_states: States drawn, evenly spread over the trajectory.
-        seed: Seeds the trajectory and its actions.
 
     Returns:
         The file written.
 
     Raises:
         UnknownNameError: No such environment.
-        ConfigError: `num_states` is less than 1.
         BadEnvironmentError: The environment's state cannot be copied.
     """
-    if num_states < 1:
-        raise ConfigError(f"num_states is {num_states}, allowed: at least 1.")
     spec = env_spec(env)
     physics = [dict(spec.default_sim_params), *spec.sim_params.group("train")]
-    changes = collect_changes(spec, physics, num_states, seed)
+    changes = collect_changes(spec, physics, num_states=100, seed=0)
     default, varied = changes[0], changes[1:]
     first, second = choose_views(varied)
     numbered = (f"observation[{i}]" for i in range(len(spec.obs_names), default.shape[-1]))
     names = [f"change of {name}" for name in (*spec.obs_names, *numbered)]
     caption = (
         f"{spec.name}, {len(default)} states of one trajectory of uniformly random actions under"
-        f" the default physics, seed {seed}. Every state is drawn once per physics, with the same"
+        f" the default physics. Every state is drawn once per physics, with the same"
         " action (grey lines join them). The axes are the observation's numbers that differ most"
         " between physics, measured against their own spread. A straight line through 0 on the"
         " right means: proportional to the change under default physics."

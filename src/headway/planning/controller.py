@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from headway.errors import ConfigError, PlanningError, shown
 from headway.models.compilation import jit_networks
 from headway.planning.agent import Agent, AgentState, Decision, open_loop
+from headway.planning.optimizers.ilqr import Policy
 from headway.planning.rollouts import follow
 from headway.task import env_action, scaled_action
 
@@ -199,11 +200,14 @@ class Controller:
     def imagine(self) -> Float[np.ndarray, "member horizon obs"] | None:
         """Observations that each member expects along the last plan, without noise.
 
-        The first one is its prediction of the next observation. None where there is no new plan:
-        before the first action, while a plan is held, and where the agent makes none.
+        The first one is its prediction of the next observation. A plan with feedback expects one
+        way, by the mean of all members, and rests in its last step. None where there is no new
+        plan: before the first action, while a plan is held, and where the agent makes none.
         """
         if self.agent.model is None or self.status is None or self.status.outcome == "held":
             return None
+        if isinstance(self._state.search, Policy):
+            return jax.device_get(self._state.search.expected)
         return jax.device_get(_imagine(self.agent, self._state))[:, 0]
 
     @property

@@ -226,6 +226,5 @@ def plan_flop(model: ModelConfig, planner: PlannerConfig, task: Task, evaluation
     products = sum(4 * (n + m) * m if recurrent else n * m for n, m in itertools.pairwise(sizes))
     numbers = outputs * task.obs_size + 2 * model.learned_reward
     per_step = 2.0 * (products + sizes[-1] * numbers)
-    mean = planner.optimizer.name == "ilqr"
-    particles = model.num_members if mean else planner.num_particles
+    particles = model.num_members if planner.optimizer.name == "ilqr" else planner.num_particles
     return evaluations * particles * planner.horizon * per_step
