@@ -13,9 +13,10 @@ from headway import task
 from headway.cli import main
 from headway.errors import BrokenEpisodeError, ConfigError
 from headway.play.page import SHIPPED, Page, play
-from headway.play.player import LEARNING, Player
+from headway.play.player import Player
 from headway.sim_params import SimParamSets, Uniform
 from headway.task import EnvSpec
+from headway.training.methods import KEEP_LEARNING
 from headway.training.run import RunDir
 from toys import PointTask
 
@@ -62,7 +63,7 @@ def lamp(tmp_path, monkeypatch, cls=Lamp):
     monkeypatch.setattr(task, "_registered", dict(task._registered))
     power = SimParamSets({"power": Uniform(1, 2)}, {"weak": {"power": [0.5]}})
     own = {"name": "lamp", "env_id": cls, "make_task": PointTask, "episode_length": 6}
-    headway.register(EnvSpec(**own, sim_params=power, default_sim_params={"power": 1.0}))
+    headway.register(EnvSpec(**own, sim_params=power))
     settings = {"collection.check": False, "collection.num_iterations": 1}
     run = headway.train(
         "lamp", method="random", preset="smoke", run_dir=tmp_path / "run", settings=settings
@@ -117,7 +118,7 @@ def test_predictions_meet_what_happens_until_it_is_pushed(pendulum):
 
 def test_the_planner_changes_while_it_plays(pendulum):
     pendulum.reset(0)
-    pendulum.switch({"planner.optimizer.name": "ilqr", **LEARNING})
+    pendulum.switch({"planner.optimizer.name": "ilqr", **KEEP_LEARNING})
     pendulum.step()
     assert pendulum.controller.agent.planner.optimizer.name == "ilqr"
     assert len(pendulum.moments) == 1
@@ -210,7 +211,7 @@ def test_an_episode_that_breaks_is_said_and_begun_again(tmp_path, monkeypatch):
 def test_what_cannot_be_played_is_one_line(tmp_path, monkeypatch, capsys):
     assert main(["play", str(tmp_path / "nothing")]) == 1
     assert "allowed: a run directory" in capsys.readouterr().err
-    with pytest.raises(ConfigError, match=r"host is 'nowhere\.invalid' .*, allowed: an address"):
+    with pytest.raises(ConfigError, match=r"host is 'nowhere\.invalid' .* an IPv4 address"):
         play(host="nowhere.invalid")
     monkeypatch.setattr("headway.errors.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"viser, mjviser not installed.*headway\[play\]"):

@@ -212,7 +212,6 @@ def load(
         ConfigError: A setting is unknown, of the wrong type or out of range, or none of the
             planner's; or as `Controller`.
     """
-    prepare_jax()
     run = RunDir(run_dir)
     config = config_to_evaluate(run.config(), settings or {}, ("planner",))
     return Controller(load_agent(run, config, iteration=iteration), seed=seed, **options)

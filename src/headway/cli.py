@@ -107,7 +107,6 @@ class Command:
 
     def with_defaults(self, names: Names) -> Self:
         """Take the settings of what is named."""
-        del names
         return self
 
     def show(self, facts: Mapping[str, Any] | Sequence[Any], *tables: Any) -> int:
@@ -236,7 +235,8 @@ class Train(Command):
         run = api.train(self.env, from_run=self.from_run, **options)
         rows = run.last_tests
         drawn = [str(path) for path in figures.save_run_figures(run.path)]
-        title = f"{run.config.env}, {run.config.method} after {len(run.metrics)} iterations"
+        after = f" after {len(run.metrics)} iterations" * run.config.model.learns
+        title = f"{run.config.env}, {run.config.method}{after}"
         tested, table = tables.evaluation(rows, run.config, title)
         facts = {
             "run_dir": str(run.path),
@@ -403,9 +403,7 @@ class Record(_OfRun):
                 )
             schedule.setdefault(int(found[1]), {}).update(_physics([found[2]], "--schedule"))
         from headway.lab.record import record
-        from headway.training.files import check_target
 
-        check_target(self.output)
         film = record(
             self.run_dir,
             self.output,
@@ -577,9 +575,7 @@ class Report(Command):
     def run(self, words):
         """Write the page, and print where it is."""
         from headway.lab.report import write_report
-        from headway.training.files import check_target
 
-        check_target(self.output)
         path = str(write_report(self.runs, self.output))
         return self.show({"report": path}, path)
 
@@ -784,9 +780,7 @@ class PlotDynamics(Command):
         """Draw, and print where the figure is."""
         from headway.lab import dynamics
         from headway.task import env_spec
-        from headway.training.files import check_target
 
-        check_target(self.output)
         path = str(dynamics.plot_dynamics(self.env, self.output))
         return self.show({"env": env_spec(self.env).name, "figure": path}, path)
 

@@ -16,7 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from headway.errors import ConfigError, UnknownNameError, one_line, shown, unknown_name
+from headway.errors import (
+    ConfigError,
+    UnknownNameError,
+    check_names,
+    one_line,
+    shown,
+    unknown_name,
+)
 from headway.sim_params import SimParamSets
 from headway.spaces import Spaces
 
@@ -98,7 +105,6 @@ class Task(eqx.Module):
 
     def terminated(self, obs: Obs, action: Action, next_obs: Obs) -> Ends:
         """Mark transitions that end the episode for good. The paper's tasks never end."""
-        del action, next_obs
         return jnp.zeros(obs.shape[:-1], dtype=bool)
 
     def preprocess(self, obs: Obs) -> Float[Array, "*batch features"]:
@@ -330,9 +336,8 @@ def env_options(config: "Config") -> dict[str, Any]:
         ConfigError: The environment has no such option, or it is a switch.
     """
     spec = env_spec(config.env)
+    check_names(f"{spec.name} option", config.env_options, spec.options)
     for option, value in config.env_options.items():
-        if option not in spec.options:
-            raise ConfigError(str(unknown_name(f"{spec.name} option", option, spec.options)))
         if isinstance(spec.options[option], bool) and not isinstance(value, bool):
             raise ConfigError(
                 f"{spec.name} option {option} is {shown(value)}, allowed: True or False (on the"

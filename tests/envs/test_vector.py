@@ -251,3 +251,17 @@ def test_a_schedule_changes_the_physics_at_its_step_of_its_environment_only(name
     one.reset(seed=7, options={"sim_params": before, "schedule": {3: change}})
     alone = np.stack([one.step(action)[0] for action in actions[:, 0]])
     np.testing.assert_array_equal(alone, runs[1][:, 0])
+
+
+def test_changes_add_up_until_the_next_step_and_end_with_the_episode():
+    vector, still = SequentialVectorEnv([lambda: envs.make("pendulum")]), np.zeros((1, 1))
+    own, before = vector.envs[0].unwrapped.vector, {"length": 1.0, "mass": 1.0}
+    vector.reset(seed=0, options={"sim_params": before})
+    vector.set_sim_params(0, {"length": 0.5})
+    vector.set_sim_params(0, {"mass": 2.0})
+    vector.step(still)
+    assert (own.sim_params["length"], own.sim_params["mass"]) == (0.5, 2.0)
+    vector.set_sim_params(0, {"length": 0.75})
+    vector.reset(options={"sim_params": before})
+    vector.step(still)
+    assert (own.sim_params["length"], own.sim_params["mass"]) == (1.0, 1.0)

@@ -86,6 +86,7 @@ def tail_flag(row, steps=25):
         (changed(episode=["a"] * 6 + ["b"] * 20), [5, 19], 2),
         (changed(terminated=tail_flag(9)), [10, 15], 2),
         (changed(terminated=True), [25], 1),
+        (changed(obs=lambda obs: obs[:-1], terminated=True), [24], 1),
         (changed(obs=lambda obs: obs[:-1], dones=tail_flag(9)), [9, 14], 2),
         (changed(**{"sim_params.length": np.repeat([0.5, 1.0], 13)}), [12, 12], 2),
         (recording(70), [30, 30, 10], 1),
@@ -105,14 +106,14 @@ def test_recordings_are_cut_where_they_must_be(table, pieces, files):
 
 def test_cuts_are_said_and_rewards_that_are_missing_are_the_tasks():
     reward = np.full(25, np.nan)
-    reward[3] = -7.0
+    reward[3], reward[4] = -7.0, np.inf
     log = read([changed(obs=with_nan([10]), reward=reward)])
     assert log.remarks[0] == "cut at 1 rows with missing numbers: 1 recordings, 2 pieces."
     assert log.remarks[1].startswith("reward: Task.reward is ")
     (piece, _), law = log.fitted, headway.env_spec("pendulum").make_task()
     obs, action = jnp.asarray(piece.obs), jnp.asarray(piece.action)
     due = law.reward(obs[:-1], 2 * action, obs[1:])
-    np.testing.assert_allclose(piece.reward[[0, 3, 8]], [due[0], -7, due[8]], rtol=1e-5)
+    np.testing.assert_allclose(piece.reward[[0, 3, 4]], [due[0], -7, due[4]], rtol=1e-5)
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -153,14 +154,15 @@ def test_files_that_cannot_be_read_are_named(name, tmp_path):
 
 @pytest.mark.usefixtures("unchecked")
 def test_files_of_another_maker_give_the_same_pieces(tmp_path):
-    """Parquet by lists and by scalars, with blanks; .npz in other types and names."""
+    """Parquet by lists and by scalars, with blanks and texts; .npz in other types and names."""
     made = recording()
     expected = read([made]).fitted[0]
     obs, action = made["obs"], np.append(made["action"], [[np.nan]], 0)
     as_lists = {"observation": obs.tolist(), "action": [*action[:-1].tolist(), None]}
     by_number = {name: obs[:, i] for i, name in enumerate(["cos", "sin", "speed"])}
     scalars = {**by_number, "torque": [*action[:-1, 0].tolist(), None]}
-    parquet.write_table(pyarrow.table(as_lists), tmp_path / "a.parquet")
+    camera = pyarrow.array(["front", "left"] * 13).dictionary_encode()
+    parquet.write_table(pyarrow.table(as_lists | {"camera": camera}), tmp_path / "a.parquet")
     parquet.write_table(pyarrow.table(scalars), tmp_path / "b.parquet")
     np.savez(tmp_path / "c.npz", states=obs, actions=action[:-1])
     names = {"obs": "cos,sin,speed", "action": "torque"}

@@ -3,7 +3,6 @@
 
 """The paper's six environments for Gymnasium, one or many."""
 
-import abc
 import copy
 import functools
 import importlib
@@ -82,19 +81,18 @@ class WorldVectorEnv(HeadwayVectorEnv):
         self._ends[:, i] = False
         self._set_state(i, state)
 
-    @abc.abstractmethod
     def get_state(self, i: int) -> np.ndarray:
         """Return everything that the future of environment `i` depends on, but its physics."""
+        raise NotImplementedError
 
-    @abc.abstractmethod
     def frame(self, i: int) -> np.ndarray:
         """Draw environment `i`."""
+        raise NotImplementedError
 
     def render(self) -> tuple[np.ndarray, ...]:
         """Draw all environments."""
         return tuple(map(self.frame, range(self.num_envs)))
 
-    @abc.abstractmethod
     def _set_state(self, i: int, state: np.ndarray) -> None:
         """Do what `set_state` says."""
 
@@ -107,9 +105,6 @@ class ClassicVectorEnv(WorldVectorEnv):
         # As they are now, and the actions that led there: [env, ...].
         self.states = np.zeros((num_envs, self.world.state_size))
         self._action = np.zeros((num_envs, self.world.task.action_size))
-
-    def _change(self, i: int, changed: SimParams) -> None:
-        """Nothing: the formula reads what is noted."""
 
     def _advance(self, active: np.ndarray, actions: np.ndarray, rewards: np.ndarray) -> None:
         sim_params = {name: values[active] for name, values in self._sim_params.items()}

@@ -3,7 +3,6 @@
 What runs in a process of its own imports this module and the environment, nothing else of Headway.
 """
 
-import abc
 import contextlib
 import multiprocessing
 import os
@@ -137,8 +136,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         for i in active.tolist():
             changed = self._schedules[i].get(int(self._elapsed[i]))
             if changed:
-                self._note(i, changed)
-                self._change(i, changed)
+                self.set_sim_params(i, changed)
         if active.size:
             self._elapsed[active] += 1
             self._advance(active, actions, rewards)
@@ -225,27 +223,24 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             )
         return actions
 
-    @abc.abstractmethod
     def _begin(self, seeds: Mapping[int, int | None], requested: Sequence[SimParams]) -> None:
         """Start episodes in the environments that have a seed or None, with their `rngs`.
 
         Their simulator parameters are noted; why one cannot begin is put into `_broken`.
         """
 
-    @abc.abstractmethod
     def _change(self, i: int, changed: SimParams) -> None:
         """Change the physics of environment `i` before its next step; they are noted already."""
 
-    @abc.abstractmethod
     def _advance(self, active: np.ndarray, actions: np.ndarray, rewards: np.ndarray) -> None:
         """Step the environments of the given indices; actions and rewards have a row for each.
 
         Fills in rewards, `_ends` and, where an episode cannot go on, `_broken`.
         """
 
-    @abc.abstractmethod
     def observe(self) -> np.ndarray:
         """Return all observations, in an array of their own."""
+        raise NotImplementedError
 
 
 def read_spaces(obs: gymnasium.Space, action: gymnasium.Space) -> Spaces:
@@ -355,6 +350,7 @@ class SequentialVectorEnv(HeadwayVectorEnv):
             asked = {i: self._sets.sample(self.rngs[i]) | given for i, given in asked.items()}
         for i, given in asked.items():
             self._note(i, given)
+            self._changes.pop(i, None)
         options = {i: {"sim_params": given} if given else None for i, given in asked.items()}
         begun = self._call("reset", {i: (seeds[i], options[i]) for i in seeds})
         for i, (obs, sim_params, spaces) in begun.items():
@@ -363,7 +359,7 @@ class SequentialVectorEnv(HeadwayVectorEnv):
             self._note(i, sim_params)
 
     def _change(self, i: int, changed: SimParams) -> None:
-        self._changes[i] = changed
+        self._changes[i] = self._changes.get(i, {}) | changed
 
     def _advance(self, active: np.ndarray, actions: np.ndarray, rewards: np.ndarray) -> None:
         calls = {i: (actions[i], self._changes.pop(i, None)) for i in active.tolist()}
@@ -433,8 +429,8 @@ def _answer(env: gymnasium.Env, method: str, *given: Any) -> Any:
         if changed:
             if not env.has_wrapper_attr("set_sim_params"):
                 raise ConfigError(
-                    "schedule was given, but the environment has no method set_sim_params(values);"
-                    " add one, or leave the schedule out."
+                    "physics are to change, but the environment has no method"
+                    " set_sim_params(values); add one, or change them at a reset."
                 )
             env.get_wrapper_attr("set_sim_params")(changed)
         obs, reward, terminated, truncated, _ = env.step(action)

@@ -2,4 +2,4 @@
 
 from headway.errors import needs
 
-needs("lab", "pandas", "scipy", "matplotlib", "jinja2")
+needs("lab", "pandas", "matplotlib", "jinja2", "imageio")

@@ -79,7 +79,6 @@ def diagnose(
         UnknownNameError: No such group.
         ConfigError: A setting is unknown, of the wrong type or out of range, or one that training
             has fixed; or the run's method has no model with heads.
-        LimitError: Planning needs more memory than is free.
     """
     run = RunDir(run_dir)
     config = config_to_evaluate(run.config(), settings or {}, ("planner",))

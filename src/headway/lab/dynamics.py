@@ -1,6 +1,7 @@
 """Next states of the same states and actions under different physics (supplement, Fig. 8)."""
 
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from headway.errors import BadEnvironmentError
 from headway.lab.figures import INK, figure, numbers
 from headway.lab.tables import Physics, full_label, varying
 from headway.task import EnvSpec, env_spec
+from headway.training.files import check_target
 
 
 def plot_dynamics(env: str, out: str | Path) -> Path:
@@ -32,6 +34,7 @@ def plot_dynamics(env: str, out: str | Path) -> Path:
         UnknownNameError: No such environment.
         BadEnvironmentError: The environment's state cannot be copied.
     """
+    check_target(Path(out))
     spec = env_spec(env)
     physics = [dict(spec.default_sim_params), *spec.sim_params.group("train")]
     changes = collect_changes(spec, physics, num_states=100, seed=0)
@@ -82,31 +85,30 @@ def collect_changes(
     Raises:
         BadEnvironmentError: The environment's state cannot be copied.
     """
-    environment = envs.make(spec.name)
-    world: Any = environment.unwrapped
-    for method in ("get_state", "set_state", "set_sim_params", "observation"):
-        if not hasattr(world, method):
-            raise BadEnvironmentError(
-                f"{spec.name} has no method {method}, allowed: environments with get_state,"
-                " set_state, set_sim_params and observation; add them to draw its dynamics."
-            )
-    world.action_space.seed(seed)
-    world.reset(seed=seed, options={"sim_params": dict(physics[0])})
-    trajectory = []
-    for _ in range(spec.episode_length):
-        trajectory.append((world.get_state(), world.action_space.sample()))
-        if world.step(trajectory[-1][1])[2]:
-            break
-    steps = np.linspace(0, len(trajectory) - 1, min(num_states, len(trajectory)), dtype=int)
-    changes = []
-    for sim_params in physics:
-        world.set_sim_params(sim_params)
-        for step in steps:
-            state, action = trajectory[step]
-            world.set_state(state)
-            before = np.asarray(world.observation(), np.float64)
-            changes.append(np.asarray(world.step(action)[0], np.float64) - before)
-    environment.close()
+    with closing(envs.make(spec.name)) as environment:
+        world: Any = environment.unwrapped
+        for method in ("get_state", "set_state", "set_sim_params", "observation"):
+            if not hasattr(world, method):
+                raise BadEnvironmentError(
+                    f"{spec.name} has no method {method}, allowed: environments with get_state,"
+                    " set_state, set_sim_params and observation; add them to draw its dynamics."
+                )
+        world.action_space.seed(seed)
+        world.reset(seed=seed, options={"sim_params": dict(physics[0])})
+        trajectory = []
+        for _ in range(spec.episode_length):
+            trajectory.append((world.get_state(), world.action_space.sample()))
+            if world.step(trajectory[-1][1])[2]:
+                break
+        steps = np.linspace(0, len(trajectory) - 1, min(num_states, len(trajectory)), dtype=int)
+        changes = []
+        for sim_params in physics:
+            world.set_sim_params(sim_params)
+            for step in steps:
+                state, action = trajectory[step]
+                world.set_state(state)
+                before = np.asarray(world.observation(), np.float64)
+                changes.append(np.asarray(world.step(action)[0], np.float64) - before)
     return np.stack(changes).reshape(len(physics), len(steps), -1)
 
 

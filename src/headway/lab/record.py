@@ -22,7 +22,7 @@ from headway.lab.tables import full_label
 from headway.planning.controller import Controller
 from headway.task import episode_length
 from headway.training.collect import Environments, raising
-from headway.training.files import write_bytes
+from headway.training.files import check_target, write_bytes
 from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
 from headway.training.run import Iteration, RunDir
@@ -104,8 +104,9 @@ def record(  # noqa: PLR0913 (keywords, all with a default)
         raise ConfigError(f"{path} cannot be a film, allowed: names ending in .gif or .mp4.")
     if num_steps is not None and num_steps < 1:
         raise ConfigError(f"num_steps is {num_steps}, allowed: at least 1.")
+    check_target(path)
     run = RunDir(run_dir)
-    config = config_to_evaluate(run.config(), settings or {})
+    config = config_to_evaluate(run.config(), settings or {}, ("planner",))
     controller = Controller(load_agent(run, config, iteration=iteration), seed=seed)
     length = num_steps or episode_length(config)
     if late := [step for step in schedule or () if isinstance(step, int) and step >= length]:

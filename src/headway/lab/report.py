@@ -24,7 +24,7 @@ import headway
 from headway.errors import ConfigError, HeadwayError
 from headway.lab import diagnose, episode, figures, statistics, tables
 from headway.lab.tables import COLLECTED, PHASES, TRAIN, group_label
-from headway.training.files import write_bytes
+from headway.training.files import check_target, write_bytes
 
 FILMS = {".gif": "image/gif", ".mp4": "video/mp4"}
 ROOM = 16  # MiB of films on a page
@@ -96,6 +96,7 @@ def write_report(runs: Sequence[str | Path], out: str | Path = "report.html") ->
     """
     if not runs:
         raise ConfigError("no run is given, allowed: one or more run directories.")
+    check_target(Path(out))
     page = Page(tables.read_runs(runs))
     diagnoses, episodes = _examined(page)
     blocks = {

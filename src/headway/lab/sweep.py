@@ -9,6 +9,7 @@ submitted again, and goes on from what it has saved.
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import json
 import logging
@@ -118,7 +119,7 @@ class Comparison:
             if not values or len(set(values)) < len(values):
                 raise ConfigError(f"{name} is {values}, allowed: one or more, each once.")
 
-    @property
+    @functools.cached_property
     def cells(self) -> dict[Cell, Job]:
         """Every place of the table with the job that fills it; several may share one.
 

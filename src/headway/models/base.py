@@ -192,32 +192,6 @@ class RecentTransitions(NamedTuple):
         return History(align(self.next_obs - self.obs), align(self.action))
 
 
-def live_through(
-    model: Model,
-    past: RecentTransitions,
-    keys: Keys,
-    sim_params: Float[Array, "env sim_param"] | None = None,
-) -> Any:
-    """The belief of a model that has observed some transitions, and nothing before.
-
-    Args:
-        model: The model.
-        past: At least one transition of each environment, in order.
-        keys: Of every `observe`.
-        sim_params: As `Model.init_belief`.
-    """
-    num_envs, slots, _ = past.obs.shape
-
-    def observe(belief, slot):
-        index, obs, action, next_obs = slot
-        seen = Transition(obs, action, next_obs, index >= slots - past.count)
-        return model.observe(belief, seen, keys), None
-
-    by_slot = (jnp.moveaxis(x, 1, 0) for x in past[:3])
-    first = model.init_belief(num_envs, sim_params)
-    return jax.lax.scan(observe, first, (jnp.arange(slots), *by_slot))[0]
-
-
 class Layer(NamedTuple):
     """One linear layer of every member; its products run in the weight's precision."""
 

@@ -44,8 +44,8 @@ def prepare_jax() -> None:
     another with `JAX_COMPILATION_CACHE_DIR` or turned it off with
     `JAX_ENABLE_COMPILATION_CACHE=0`. Programs that take 0.05 s to compile are kept, because a plan
     is several of them and JAX would keep none; `JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS` says
-    otherwise. `headway.train`, `load`, `evaluate` and the command line call this; importing
-    Headway changes nothing.
+    otherwise. Training, fitting, checking, loading an agent and the command line call this;
+    importing Headway changes nothing.
 
     Raises:
         ConfigError: JAX is in 64-bit mode, or set to something else that changes the numbers.

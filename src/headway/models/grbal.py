@@ -218,38 +218,39 @@ class GrBAL(Model):
         return AdaptedDynamics(layers, self.statistics, self.task)
 
 
-class AdaptedDynamics(Dynamics):
-    """A plain network whose weights differ between environments."""
+class PlainDynamics(Dynamics):
+    """A network without heads: how observations enter and leave it, in the layout of a plan."""
 
-    own: tuple[Layer, ...]
     statistics: Statistics
     task: Task
 
+    def wide_input(
+        self,
+        obs: Float[Array, "1 obs particle candidate"],
+        action: Float[Array, "1 action particle candidate"],
+    ) -> Float[Array, "1 in particle candidate"]:
+        """`network_input` of every row."""
+        return over_rows(functools.partial(network_input, self.task, self.statistics))(obs, action)
+
+    def next_obs(
+        self,
+        obs: Float[Array, "1 obs particle candidate"],
+        normalized: Float[Array, "1 obs particle candidate"],
+    ) -> Float[Array, "1 obs particle candidate"]:
+        """Next observation after a predicted, normalised `delta`."""
+        delta = over_rows(self.statistics.delta.denormalize)(normalized)
+        return over_rows(self.task.postprocess)(obs, delta)
+
+
+class AdaptedDynamics(PlainDynamics):
+    """A plain network whose weights differ between environments."""
+
+    own: tuple[Layer, ...]
+
     def step(self, carry, obs, action, noise):
         """See `Dynamics.step`."""
-        x = wide_input(self.task, self.statistics, obs, action)
+        x = self.wide_input(obs, action)
         *hidden, output = self.own
         for layer in hidden:
             x = jax.nn.relu(layer(x))
-        return carry, next_obs(self.task, self.statistics, obs, output(x))
-
-
-def wide_input(
-    task: Task,
-    statistics: Statistics,
-    obs: Float[Array, "1 obs particle candidate"],
-    action: Float[Array, "1 action particle candidate"],
-) -> Float[Array, "1 in particle candidate"]:
-    """`network_input` in the layout of a plan."""
-    return over_rows(functools.partial(network_input, task, statistics))(obs, action)
-
-
-def next_obs(
-    task: Task,
-    statistics: Statistics,
-    obs: Float[Array, "1 obs particle candidate"],
-    normalized: Float[Array, "1 obs particle candidate"],
-) -> Float[Array, "1 obs particle candidate"]:
-    """Next observation after a predicted, normalised `delta`, in the layout of a plan."""
-    delta = over_rows(statistics.delta.denormalize)(normalized)
-    return over_rows(task.postprocess)(obs, delta)
+        return carry, self.next_obs(obs, output(x))

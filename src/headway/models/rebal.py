@@ -13,10 +13,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from headway.config import ModelConfig, Precision
 from headway.data import where_env
-from headway.models.base import Dynamics, Keys, Layer, Model, Transition, plan_layers
+from headway.models.base import Keys, Layer, Model, Transition, plan_layers
 from headway.models.compilation import jit_networks
 from headway.models.fitting import EpochStats, FitData, FitSetup, FitState, run_updates
-from headway.models.grbal import Window, glorot, next_obs, wide_input, window
+from headway.models.grbal import PlainDynamics, Window, glorot, window
 from headway.models.networks import Dense
 from headway.models.statistics import Statistics, network_input
 from headway.task import Task
@@ -186,16 +186,14 @@ class ReBAL(Model):
     ) -> "RecurrentDynamics":
         """See `Model.dynamics`."""
         layers = plan_layers((*self.net.layers, self.net.output), precision)
-        return RecurrentDynamics(belief, layers, self.statistics, self.task)
+        return RecurrentDynamics(belief, self.statistics, self.task, layers)
 
 
-class RecurrentDynamics(Dynamics):
+class RecurrentDynamics(PlainDynamics):
     """A recurrent network whose state goes on with every imagined step."""
 
     own: tuple[CellState, ...]
     layers: tuple[Layer, ...]
-    statistics: Statistics
-    task: Task
 
     def start(self) -> tuple[CellState, ...]:
         """See `Dynamics.start`."""
@@ -203,11 +201,11 @@ class RecurrentDynamics(Dynamics):
 
     def step(self, carry, obs, action, noise):
         """See `Dynamics.step`."""
-        x = wide_input(self.task, self.statistics, obs, action)
+        x = self.wide_input(obs, action)
         *layers, output = self.layers
         states = []
         for layer, before in zip(layers, carry, strict=True):
             gates = layer(jnp.concatenate([x, before.hidden], axis=1))
             states.append(next_cell(before, gates, axis=1))
             x = states[-1].hidden
-        return tuple(states), next_obs(self.task, self.statistics, obs, output(x))
+        return tuple(states), self.next_obs(obs, output(x))

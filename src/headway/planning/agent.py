@@ -47,7 +47,8 @@ class Decision(NamedTuple):
     failures: Int[Array, " env"]
     """Planner iterations without any finite return."""
     evaluations: Int[Array, " env"]
-    """Candidates whose return was imagined, each with `num_particles` rollouts."""
+    """Candidates whose return was imagined, each with `num_particles` rollouts (iLQR: one of each
+    member)."""
 
 
 class Plan(NamedTuple):

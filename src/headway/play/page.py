@@ -18,9 +18,10 @@ import numpy as np
 
 from headway.config import OPTIMIZERS
 from headway.errors import BadEnvironmentError, ConfigError, needs
-from headway.play.player import LEARNING, REMEMBERED, Player
+from headway.play.player import REMEMBERED, Player
 from headway.sim_params import Uniform
 from headway.training.collect import raising
+from headway.training.methods import KEEP_LEARNING
 from headway.worlds.classic import CartPoleSwingUp
 from headway.worlds.rendering import BODY, CART, GRID, HEADS, INK
 
@@ -56,7 +57,7 @@ def play(run_dir: str | Path | None = None, *, host: str = "127.0.0.1", port: in
         socket.create_server((host, 0)).close()
     except OSError as error:
         raise ConfigError(
-            f"host is {host!r} ({error.strerror}), allowed: an address of this machine."
+            f"host is {host!r} ({error.strerror}), allowed: an IPv4 address of this machine."
         ) from None
     player = Player(run_dir or SHIPPED)
     try:
@@ -86,7 +87,7 @@ class Page:
         self.player, config = player, player.config
         with contextlib.redirect_stdout(io.StringIO()):  # which is for results
             self.server: Any = viser.ViserServer(host=host, port=port, verbose=False)
-        own = "127.0.0.1" if host in ("0.0.0.0", "::") else host
+        own = "127.0.0.1" if host == "0.0.0.0" else host
         self.address = f"http://{own}:{self.server.get_port()}"
         self._next = {"scene": 0.0, "plots": 0.0}
         gui = self.server.gui
@@ -150,7 +151,7 @@ class Page:
     def _switch(self) -> None:
         self._status.content = "Compiling the plan …"
         settings = {"planner.optimizer.name": self._optimizer.value}
-        self.player.switch(settings | (LEARNING if self._learn.value else {}))
+        self.player.switch(settings | (KEEP_LEARNING if self._learn.value else {}))
 
     def _plot(self, *names: str) -> Any:
         """A plot of lines over the last steps, in seconds from now."""

@@ -22,8 +22,6 @@ REMEMBERED = 200
 """Steps that are remembered, and shown."""
 IDLE_S = 0.2
 """Longest sleep while nothing moves."""
-LEARNING = {"planner.adaptation": "last-layer", "planner.change_threshold": 20.0}
-"""Settings of heads that keep learning, as docs/adaptation.md measures them."""
 
 
 class Moment(NamedTuple):
@@ -80,7 +78,8 @@ class Player:
         self.asked: queue.Queue[Callable[[], Any]] = queue.Queue()
         """Changes that wait."""
         self._ends: deque[float] = deque(maxlen=21)  # times at which the last steps ended
-        self.sim_params = dict(self.spec.default_sim_params)
+        usual = self._sets.group("train")[0]  # where the environment states none
+        self.sim_params = {**usual, **self.spec.default_sim_params}
         """The physics now in force, or at the next reset."""
         self.reset(0)
 
@@ -93,8 +92,10 @@ class Player:
         """
         physics = [row for group in self._sets.group_names for row in self._sets.group(group)]
         signed, found = getattr(getattr(self.env, "world", None), "signed", ()), {}
-        for name, usual in self.spec.default_sim_params.items():
-            values = {float(usual)} | ({-1.0, 1.0} if name in signed else set())
+        for name, now in self.sim_params.items():
+            values = {self.spec.default_sim_params.get(name, now)} | (
+                {-1.0, 1.0} if name in signed else set()
+            )
             values |= {row[name] for row in physics if name in row}
             kinds = min(values) <= 0 and all(value.is_integer() for value in values)
             if len(values) > 1:

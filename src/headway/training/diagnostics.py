@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from headway.data import Trajectory, sim_params_row
-from headway.models.base import Keys, Model, RecentTransitions, live_through
+from headway.models.base import Keys, Model, RecentTransitions, Transition
 from headway.planning.rollouts import follow
 
 NUM_STARTS = 256  # imagined rollouts per group in `prediction_error`
@@ -82,6 +82,15 @@ def imagine(
 
     And the head of every member; None where a model has none.
     """
-    belief = live_through(model, past, keys, sim_params)
+    num_envs, slots, _ = past.obs.shape
+
+    def observe(belief, slot):
+        index, obs, action, next_obs = slot
+        seen = Transition(obs, action, next_obs, index >= slots - past.count)
+        return model.observe(belief, seen, keys), None
+
+    by_slot = (jnp.moveaxis(x, 1, 0) for x in past[:3])
+    first = model.init_belief(num_envs, sim_params)
+    belief, _ = jax.lax.scan(observe, first, (jnp.arange(slots), *by_slot))
     imagined = follow(model.dynamics(belief), past.next_obs[:, -1], actions)
     return imagined, getattr(belief, "heads", None)

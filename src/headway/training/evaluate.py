@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from headway.config import Config, differences, override, tolerating_as
 from headway.data import Trajectory
 from headway.errors import check_names
-from headway.models.compilation import prepare_jax
 from headway.planning.agent import Agent
 from headway.planning.rollouts import plan_flop
 from headway.sim_params import SimParamSets
@@ -232,7 +231,6 @@ def evaluate(
         ConfigError: A setting is unknown, of the wrong type or out of range, or one that
             training has fixed; or a simulator parameter is unknown or no number.
     """
-    prepare_jax()
     run, changes = RunDir(run_dir), dict(settings or {})
     if num_episodes is not None:
         changes["evaluation.num_episodes"] = num_episodes

@@ -137,13 +137,12 @@ def make_dir(path: Path) -> None:
 
 def _sync_dir(path: Path) -> None:
     """Make renames and deletions survive a loss of power, where a file system can promise it."""
-    if os.name == "posix":
-        with contextlib.suppress(OSError):
-            handle = os.open(path, os.O_RDONLY)
-            try:
-                os.fsync(handle)
-            finally:
-                os.close(handle)
+    with contextlib.suppress(OSError):
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 @contextlib.contextmanager

@@ -214,7 +214,6 @@ def _quick(spec: EnvSpec) -> Settings:
 
 
 def _smoke(spec: EnvSpec) -> Settings:
-    del spec
     return {
         "model.num_members": 2,
         "model.hidden_sizes": (16, 16),

@@ -172,7 +172,7 @@ def _parquet(file: Path) -> Mapping[str, Any]:
 
     def array(column: Any) -> np.ndarray:
         """A column; what is missing is NaN."""
-        if not hasattr(column.type, "value_type"):
+        if not hasattr(column.type, "value_field"):  # no list
             return column.to_numpy()
         rows = column.to_pylist()
         width = max((len(row) for row in rows if row), default=0)
@@ -236,16 +236,12 @@ class _Table:
             )
         return values
 
-    def column(self, name: str, rows: int, default: Any = 0.0) -> np.ndarray:
-        """A number for each row, or one for all; of the last row nothing need be said.
-
-        One that says how an episode ended is of the last action.
-        """
+    def column(self, name: str, rows: int, default: Any = 0.0, first: int = 0) -> np.ndarray:
+        """A number for each row, or one for all from the first; the last row's may be missing."""
         found = self.numbers(name)
         values = found[:, 0] if len(found) else np.atleast_1d(default)
         if len(values) == 1:
-            last = name in ("terminated", "truncated")
-            return np.where(np.arange(rows) >= last * (rows - 2), values, 0.0)
+            return np.where(np.arange(rows) >= first, values, 0.0)
         if len(values) == rows - 1:
             more = values[-1:] - values[-2:-1] if name == "time" else 0.0
             values = np.append(values, values[-1:] + more)
@@ -262,7 +258,7 @@ class _Rows(NamedTuple):
     action: np.ndarray
     """In [-1, 1]."""
     reward: np.ndarray
-    """NaN where it is missing."""
+    """Not finite where it is missing."""
     terminated: np.ndarray
     valid: np.ndarray
     """A transition begins here."""
@@ -282,6 +278,7 @@ def _read(
             f"{table.where} has {rows} obs and {len(action)} actions, allowed: as many of both, or"
             " one obs more; at least 2 obs."
         )
+    last = len(action) - 1  # one number that says how it ended is of the last action
     with np.errstate(over="ignore"):  # what becomes infinite is missing
         obs = obs.astype(np.float32)
     action = np.append(action[: rows - 1], low[None], axis=0)
@@ -295,7 +292,8 @@ def _read(
     usual = np.median(period[period > 0]) if (period > 0).any() else np.nan
     gap = ~other & ~(np.abs(period / usual - 1) <= JITTER)
     terminated, truncated = (
-        np.nan_to_num(table.column(name, rows)).astype(bool) for name in ("terminated", "truncated")
+        np.nan_to_num(table.column(name, rows, first=last)).astype(bool)
+        for name in ("terminated", "truncated")
     )
     ends = terminated | truncated
     seen = np.isfinite(obs).all(1)
@@ -329,7 +327,7 @@ def _pieces(
 ) -> list[Trajectory]:
     """Cut rows into trajectories without a gap; rewards that are missing are the Task's."""
     obs = jnp.asarray(rows.obs)
-    reward, unknown = rows.reward[:-1], np.isnan(rows.reward[:-1])
+    reward, unknown = rows.reward[:-1], ~np.isfinite(rows.reward[:-1])
     if unknown.any():
         action = task.scale_action(jnp.asarray(rows.action[:-1]))
         reward = np.where(unknown, task.reward(obs[:-1], action, obs[1:]), reward)

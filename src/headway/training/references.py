@@ -24,7 +24,6 @@ _REFERENCES = {
     )
     for row in _ROWS
 }
-_MEASURED = {row["env"] for row in _ROWS}
 
 
 def score_of(row: EpisodeRow, config: Config) -> float | None:
@@ -37,7 +36,7 @@ def score_of(row: EpisodeRow, config: Config) -> float | None:
         row: The episode.
         config: Settings of the run that was tested.
     """
-    if config.env not in _MEASURED or env_options(config) != env_spec(config.env).options:
+    if env_options(config) != env_spec(config.env).options:
         return None
     return score(config.env, row.sim_params, row.episode_return, episode_length(config))
 
@@ -56,8 +55,6 @@ def score(
     Returns:
         The score, or None where no reference is known for these physics and this length.
     """
-    if env not in _MEASURED:
-        return None
     sim_params = {**env_spec(env).default_sim_params, **sim_params}
     for name, value in sim_params.items():
         found = _REFERENCES.get((env, length, name, value))

@@ -18,7 +18,6 @@ from headway.config import (
     BUILT_IN_KINDS,
     MODELS,
     Config,
-    GradientAdaptedConfig,
     ModelConfig,
     OwnModelConfig,
     override,
@@ -26,6 +25,7 @@ from headway.config import (
 from headway.data import Episodes, Samples, Trajectory
 from headway.errors import ConfigError
 from headway.models.base import Model
+from headway.models.compilation import prepare_jax
 from headway.models.fitting import (
     EpochStats,
     FitSetup,
@@ -66,7 +66,6 @@ class Trainer:
 
     def init(self, key: PRNGKeyArray) -> Any:
         """Draw the state that training begins with."""
-        del key
         return ()
 
     def num_epochs(self, trajectories: Sequence[Trajectory]) -> int:
@@ -111,7 +110,6 @@ class Trainer:
             state: The state of training.
             trajectories: Data that it was fitted to; only heads that keep learning ask.
         """
-        del state, trajectories
         return None
 
     def agent(self, state: Any, trajectories: Sequence[Trajectory] = ()) -> Agent:
@@ -122,12 +120,10 @@ class Trainer:
         self, state: Any, trajectories: list[Trajectory]
     ) -> Iterable[Float[np.ndarray, "member head time"]]:
         """Loss of every head along each trajectory; none where there are no heads."""
-        del state, trajectories
         return ()
 
     def head_shares(self, state: Any, trajectories: list[Trajectory]) -> list[dict[str, Any]]:
         """Rows of `assignments.csv`, without the iteration; none where there are no heads."""
-        del state, trajectories
         return []
 
     def prediction_error(
@@ -302,8 +298,7 @@ class GradientAdaptedTrainer(Fitted):
     @property
     def inner_step(self) -> dict[str, Any]:
         """Transitions that a gradient step adapts to, and its size."""
-        model = self.config.model
-        assert isinstance(model, GradientAdaptedConfig)
+        model: Any = self.config.model
         return {"length": model.adaptation_length, "rate": model.adaptation_rate}
 
     def init(self, key: PRNGKeyArray) -> TrainState:
@@ -421,6 +416,7 @@ def load_agent(
         RunError: There is no run, it does not keep the iteration, or it is damaged.
         ConfigError: It is a run on the true dynamics, and there are no environments.
     """
+    prepare_jax()
     config = config or run.config()
     changed = run.environment_changes()
     if changed:

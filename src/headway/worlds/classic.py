@@ -56,12 +56,10 @@ class CartPoleSwingUpTask(Task):
 
     def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """Height of the pole's tip after the step, scaled to [0, 1]."""
-        del obs, action
         return 0.5 * (1.0 + next_obs[..., 2])
 
     def terminated(self, obs: Obs, action: Action, next_obs: Obs) -> Ends:
         """Mark where the cart left the track, if that ends an episode."""
-        del obs, action
         return (jnp.abs(next_obs[..., 0]) > TRACK_LIMIT) & self.terminate_off_track
 
 
@@ -133,7 +131,6 @@ class CartPoleSwingUp(ClassicWorld):
 
     def reward(self, state: np.ndarray, action: np.ndarray, next_state: np.ndarray) -> np.ndarray:
         """Height of the pole's tip after the step, as observed."""
-        del state, action
         return 0.5 * (1.0 + self.observe(next_state)[..., 2].astype(np.float64))
 
     def terminated(self, next_state: np.ndarray) -> np.ndarray:
@@ -156,12 +153,10 @@ class PendulumTask(Task):
 
     def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """Minus the cost of angle, speed and torque before the step."""
-        del next_obs
         return -_swing_cost(obs) - 0.001 * jnp.square(self.clip_action(action)[..., 0])
 
     def released_reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """Cost of CaDM's released pendulum: the torque counts in units of its limit."""
-        del next_obs
         return -_swing_cost(obs) - 0.001 * jnp.square(self.unscale_action(action)[..., 0])
 
 
@@ -235,7 +230,6 @@ class Pendulum(ClassicWorld):
 
     def reward(self, state: np.ndarray, action: np.ndarray, next_state: np.ndarray) -> np.ndarray:
         """Minus the cost of angle, speed and commanded torque before the step."""
-        del next_state
         angle, spin = np.moveaxis(state, -1, 0)
         wrapped = np.mod(angle + np.pi, 2 * np.pi) - np.pi
         torque = action[..., 0]

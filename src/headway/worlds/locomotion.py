@@ -66,14 +66,12 @@ class Robot(World):
     def initial_state(self, rng: np.random.Generator) -> np.ndarray:
         """Draw positions and velocities that an episode starts with, at no average velocity."""
         positions, velocities, size = self.start_noise
-        draw = {
-            "uniform": lambda count: rng.uniform(-size, size, count),
-            "normal": lambda count: rng.normal(0.0, size, count),
-        }
-        qpos = self.nominal.qpos0 + draw[positions](self.nominal.nq)
+        ends = {"uniform": (-size, size), "normal": (0.0, size)}
+        moved = getattr(rng, positions)(*ends[positions], self.nominal.nq)
+        qpos = self.nominal.qpos0 + moved
         if self.nominal.nq > self.nominal.nv:  # has a quaternion, which MuJoCo 2.0 normalised
             qpos[3:7] /= np.linalg.norm(qpos[3:7])
-        qvel = draw[velocities](self.nominal.nv)
+        qvel = getattr(rng, velocities)(*ends[velocities], self.nominal.nv)
         return np.concatenate([qpos, qvel, np.zeros(self.nominal.nv + 1)])
 
     def set_physics(self, model: Any, sim_params: Mapping[str, float]) -> None:
@@ -91,12 +89,10 @@ class Robot(World):
 
     def control(self, action: np.ndarray, sim_params: Mapping[str, Any]) -> np.ndarray:
         """Return what the actuators receive."""
-        del sim_params
         return action
 
     def reward(self, before: RobotState, action: np.ndarray, after: RobotState) -> np.ndarray:
         """Return the reward [...] of a step: forward velocity, being alive, and effort."""
-        del before
         return after.velocity + self.alive - self.effort * np.square(action).sum(-1)
 
     def after_step(self, before: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> RobotState:
@@ -147,13 +143,11 @@ class HopperTask(Task):
 
     def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """Forward velocity over the step, a constant for being alive, and the effort."""
-        del obs
         velocity = next_obs[..., 11 if self.observe_average_velocity else 5]
         return velocity + 1.0 - 1e-3 * _effort(self.clip_action(action))
 
     def released_reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """As released: the clipped velocity before the step."""
-        del next_obs
         return obs[..., 5] + 1.0 - 1e-3 * _effort(self.unscale_action(action))
 
     def preprocess(self, obs: Obs) -> Float[Array, "*batch features"]:
@@ -255,7 +249,6 @@ class SlimHumanoidTask(Task):
 
     def released_reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """As released: unscaled effort, and `obs[1]` (of the quaternion) taken for the height."""
-        del next_obs
         standing = (obs[..., 1] > 1.0) & (obs[..., 1] < 2.0)
         effort = _effort(self.unscale_action(action))
         return 0.25 / 0.015 * obs[..., 22] - 0.1 * effort + 5.0 * standing
@@ -335,12 +328,10 @@ class HalfCheetahTask(Task):
 
     def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """Forward velocity over the step, and the effort."""
-        del obs
         return next_obs[..., 0] - 0.1 * _effort(self.clip_action(action))
 
     def released_reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """As released: the velocity over the step before."""
-        del next_obs
         return obs[..., 0] - 0.1 * _effort(self.unscale_action(action))
 
     def preprocess(self, obs: Obs) -> Float[Array, "*batch features"]:
@@ -424,7 +415,6 @@ class CrippledAntTask(Task):
 
     def reward(self, obs: Obs, action: Action, next_obs: Obs) -> Reward:
         """Forward velocity of the torso over the step, and a constant for being alive."""
-        del action
         return (next_obs[..., 38] - obs[..., 38]) / 0.05 + 0.05
 
 

@@ -6,8 +6,6 @@ Environments are independent; they are searched side by side.
 
 from headway.config import PlannerConfig
 from headway.planning.optimizers.base import Optimizer as Optimizer
-from headway.planning.optimizers.base import Score as Score
-from headway.planning.optimizers.base import Search as Search
 from headway.planning.optimizers.cem import CEM as CEM
 from headway.planning.optimizers.icem import ICEM as ICEM
 from headway.planning.optimizers.ilqr import ILQR as ILQR

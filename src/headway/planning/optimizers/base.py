@@ -10,11 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-Score = Callable[
-    [Float[Array, "env candidate horizon action"], PRNGKeyArray], Float[Array, "env candidate"]
-]
-"""Returns of candidates, by a key; a non-finite one ranks last."""
-
 
 class Search(NamedTuple):
     """A search under way; its plan may be taken after any iteration."""
@@ -92,12 +87,12 @@ class Optimizer(eqx.Module):
         """
 
     def optimize(
-        self, score: Score, search: Search, *, key: PRNGKeyArray, project: Callable = lambda x: x
+        self, score: Callable, search: Search, *, key: PRNGKeyArray, project: Callable = lambda x: x
     ) -> Search:
         """Search for the best action sequence of every environment.
 
         Args:
-            score: Returns of candidates.
+            score: Returns [env, candidate] of candidates, by a key; a non-finite one ranks last.
             search: Where to start.
             key: Draws the candidates, and is handed on to `score`.
             project: Turns candidates into actions that can be taken, before they are scored.
