@@ -211,7 +211,8 @@ def test_an_episode_that_breaks_is_said_and_begun_again(tmp_path, monkeypatch):
 def test_what_cannot_be_played_is_one_line(tmp_path, monkeypatch, capsys):
     assert main(["play", str(tmp_path / "nothing")]) == 1
     assert "allowed: a run directory" in capsys.readouterr().err
-    with pytest.raises(ConfigError, match=r"host is 'nowhere\.invalid' .* an IPv4 address"):
+    refused = r"host is 'nowhere\.invalid' .*, allowed: an IPv4 address"
+    with pytest.raises(ConfigError, match=refused):
         play(host="nowhere.invalid")
     monkeypatch.setattr("headway.errors.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"viser, mjviser not installed.*headway\[play\]"):

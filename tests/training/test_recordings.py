@@ -113,7 +113,8 @@ def test_cuts_are_said_and_rewards_that_are_missing_are_the_tasks():
     (piece, _), law = log.fitted, headway.env_spec("pendulum").make_task()
     obs, action = jnp.asarray(piece.obs), jnp.asarray(piece.action)
     due = law.reward(obs[:-1], 2 * action, obs[1:])
-    np.testing.assert_allclose(piece.reward[[0, 3, 4]], [due[0], -7, due[4]], rtol=1e-5)
+    found = piece.reward[[0, 3, 4, 8]]
+    np.testing.assert_allclose(found, [due[0], -7, due[4], due[8]], rtol=1e-5)
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -95,6 +95,7 @@ class WorldVectorEnv(HeadwayVectorEnv):
 
     def _set_state(self, i: int, state: np.ndarray) -> None:
         """Do what `set_state` says."""
+        raise NotImplementedError
 
 
 class ClassicVectorEnv(WorldVectorEnv):

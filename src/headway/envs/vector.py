@@ -1,6 +1,6 @@
 """Many environments stepped at once, each with its own physics; also environments of your own.
 
-What runs in a process of its own imports this module and the environment, nothing else of Headway.
+What runs in a process of its own imports this module, what it needs, and the environment; no JAX.
 """
 
 import contextlib
@@ -228,6 +228,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Their simulator parameters are noted; why one cannot begin is put into `_broken`.
         """
+        raise NotImplementedError
 
     def _change(self, i: int, changed: SimParams) -> None:
         """Change the physics of environment `i` before its next step; they are noted already."""
@@ -237,6 +238,7 @@ class HeadwayVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Fills in rewards, `_ends` and, where an episode cannot go on, `_broken`.
         """
+        raise NotImplementedError
 
     def observe(self) -> np.ndarray:
         """Return all observations, in an array of their own."""

@@ -78,8 +78,9 @@ class Player:
         self.asked: queue.Queue[Callable[[], Any]] = queue.Queue()
         """Changes that wait."""
         self._ends: deque[float] = deque(maxlen=21)  # times at which the last steps ended
-        usual = self._sets.group("train")[0]  # where the environment states none
-        self.sim_params = {**usual, **self.spec.default_sim_params}
+        # An environment may state no default physics; then they are the first of training.
+        self._usual = self._sets.group("train")[0] | dict(self.spec.default_sim_params)
+        self.sim_params = dict(self._usual)
         """The physics now in force, or at the next reset."""
         self.reset(0)
 
@@ -92,10 +93,8 @@ class Player:
         """
         physics = [row for group in self._sets.group_names for row in self._sets.group(group)]
         signed, found = getattr(getattr(self.env, "world", None), "signed", ()), {}
-        for name, now in self.sim_params.items():
-            values = {self.spec.default_sim_params.get(name, now)} | (
-                {-1.0, 1.0} if name in signed else set()
-            )
+        for name, usual in self._usual.items():
+            values = {float(usual)} | ({-1.0, 1.0} if name in signed else set())
             values |= {row[name] for row in physics if name in row}
             kinds = min(values) <= 0 and all(value.is_integer() for value in values)
             if len(values) > 1:
