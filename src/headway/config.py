@@ -586,7 +586,7 @@ def _unknown(name: str) -> str:
     if (near and near[0] == name.rpartition(".")[2]) or not close:
         close = [tails[tail] for tail in near]
     hint = f" Did you mean {close[0]!r}?" if close else ""
-    return f"unknown setting {name!r}.{hint} `headway train ENV --help` lists all settings."
+    return f"unknown setting {name!r}.{hint} `headway train ENV --help-all` lists all settings."
 
 
 def _in_words(error: pydantic.ValidationError) -> str:
