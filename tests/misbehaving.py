@@ -101,6 +101,9 @@ class Drift(gymnasium.Env):
     def pay_too_much(self):
         return {"reward": np.inf}
 
+    def leave_float32(self):
+        return {"obs": np.array([0.0, 1e39, 0.0])}
+
     def count(self):
         return {"obs": np.array([1, 2, 3]), "reward": 1}
 

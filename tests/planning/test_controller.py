@@ -206,6 +206,19 @@ def test_a_plan_without_finite_returns_is_held_and_said():
     assert controller.status.reason.startswith("none of 4 iterations")
 
 
+def test_an_action_that_was_never_returned_is_not_learned_from():
+    agent = toys.make_agent()
+    controller = Controller(agent)
+    controller.agent = dataclasses.replace(
+        agent, model=jax.tree.map(lambda x: x * np.nan, agent.model)
+    )
+    with pytest.raises(PlanningError, match="finite return"):
+        controller.act(OBS)
+    controller.agent = agent
+    controller.act(OBS)
+    assert int(controller._state.belief.recent.count[0]) == 0
+
+
 def test_an_iteration_that_failed_is_no_failed_plan(monkeypatch):
     act = Agent.act
 

@@ -67,6 +67,7 @@ INVALID = [
     ("give_up", {}, "the robot fell apart"),
     ("lose_a_number", {}, "returned a non-finite obs"),
     ("pay_too_much", {}, "returned a non-finite reward"),
+    ("leave_float32", {}, "returned a non-finite obs"),
 ]
 
 
@@ -91,6 +92,14 @@ def test_an_invalid_episode_is_dropped_or_stops_the_run_and_loses_nothing(
     drift()
     train_run(config(), tmp_path / "run")  # in one process, now that it is mended
     assert runs.result(tmp_path / "run") == wanted
+
+
+def test_episodes_that_only_fill_a_batch_do_not_count(drift, tmp_path):
+    own = {"collection.num_iterations": 1, "collection.num_episodes": 4}  # groups share a batch
+    run = train_run(config(**own), tmp_path / "run")
+    drift("give_up", drift=FAR)
+    with pytest.raises(BadEnvironmentError, match="2 episodes broke, allowed: 0"):
+        headway.evaluate(run.path, groups=["far"])
 
 
 def test_tests_that_break_stop_the_run_until_they_may_be_left_out(drift, sound, tmp_path):

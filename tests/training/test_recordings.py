@@ -17,6 +17,7 @@ from headway.errors import ConfigError, HeadwayError
 from headway.training import recordings
 from headway.training.recordings import export_data, read_log
 from headway.training.run import RunDir
+from headway.training.trainers import Trainer
 
 
 def register(name, env_id, make_task, sets):
@@ -277,6 +278,32 @@ def test_other_recordings_are_another_run(fitted, folder):
         headway.fit([recording()], "pendulum", **settings)
     again = headway.fit(folder, "pendulum", **settings)
     assert again.metrics == fitted.metrics
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("change", [{"sim_params.length": 0.5}, {"terminated": True}], ids=str)
+def test_recordings_with_other_labels_are_other_recordings(change):
+    labelled = {"sim_params.length": 1.0, "terminated": False}
+    logs = [read([recording() | labels]) for labels in (labelled, labelled, labelled | change)]
+    first, again, other = (log.config.log["sha256"] for log in logs)
+    assert first == again != other
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_physics_that_the_model_is_told_are_asked_for_before_anything_is_written(tmp_path):
+    with pytest.raises(ConfigError, match=r"lack length, mass"):
+        headway.fit(
+            [recording()], "pendulum", method="oracle-params", preset="smoke", run_dir=tmp_path
+        )
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_fit_whose_imagination_explodes_is_saved(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(Trainer, "prediction_error", lambda *_: np.array([0.5, np.inf, np.nan]))
+    given = {"preset": "smoke", "run_dir": tmp_path, "settings": SETTINGS}
+    errors = headway.fit(folder, "pendulum", **given).metrics[-1]["held_out_error"]
+    assert errors[0] == 0.5
+    assert errors[1] == errors[2] > 1e38
 
 
 def test_training_goes_on_from_a_fit(fitted):

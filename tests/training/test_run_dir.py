@@ -102,6 +102,20 @@ def test_a_damaged_checkpoint_is_not_loaded(root):
         headway.load(root)
 
 
+def test_damaged_data_are_not_loaded(root):
+    flip(root / "data/iteration-000.safetensors")
+    with pytest.raises(RunError, match=r"iteration-000.*damaged"):
+        RunDir(root).load_data()
+
+
+def test_what_was_left_unfinished_in_a_run_is_tidied_away(root, reference):
+    (root / ".pendulum-v0.writing" / "data").mkdir(parents=True)
+    (root / ".config.json.77.writing").write_text("{")
+    train_run(runs.tiny_config(), root)
+    assert not list(root.rglob(".*.writing"))
+    assert runs.result(root) == runs.result(reference)
+
+
 def test_a_checkpoint_of_another_model_is_refused(root):
     config = runs.tiny_config(**{"model.hidden_sizes": (9, 9)})
     with pytest.raises(RunError, match="belongs to another model"):
@@ -238,7 +252,7 @@ def test_only_regular_files_are_replaced(name, tmp_path, monkeypatch):
 def test_writing_does_not_follow_a_link_that_lies_in_wait(tmp_path):
     victim = tmp_path / "victim.txt"
     victim.write_text("mine")
-    (tmp_path / ".table.csv.writing").symlink_to(victim)
+    (tmp_path / f".table.csv.{os.getpid()}.writing").symlink_to(victim)
     write_bytes(tmp_path / "table.csv", b"rows")
     assert victim.read_text() == "mine"
 

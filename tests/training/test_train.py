@@ -86,6 +86,15 @@ def test_new_draws_are_said_and_physics_need_no_group(reference):
         headway.evaluate(reference, sim_params={"lenth": 2.0})
 
 
+def test_other_physics_beside_a_group_leave_its_episodes_alone(tmp_path):
+    far = {"length": [3.0, 4.0], "mass": [5.0, 6.0]}  # in another order than in training
+    sets = {"train": {"mass": [1.0], "length": [1.0, 2.0]}, "unseen": {"far": far}}
+    own = {"sim_params": sets, "evaluation.num_episodes": 4}
+    run = train.train_run(runs.random_config(**own), tmp_path / "run")
+    found = headway.evaluate(run.path, groups=["far"], sim_params={"length": 9.0})
+    assert rows_of(found, ["far"], 0) == rows_of(run.evaluation(), ["far"], 0)
+
+
 def test_each_iteration_is_told_once_it_counts(tmp_path):
     told = []
 
@@ -248,6 +257,17 @@ def test_few_data_are_gone_through_until_there_were_enough_updates(least, passes
     found = [stats for _, stats in trainer.fit(trainer.begin(), episodes(), 0, jax.random.key(0))]
     assert len(found) == passes
     assert {int(stats.updates) for stats in found} == {5}
+
+
+@pytest.mark.parametrize("method", ["tmcl", "pets", "grbal", "rebal", "ria"])
+def test_updates_are_those_that_a_pass_makes(method):
+    settings = {"fitting.batch_size": 16, "fitting.epochs": 1}
+    settings |= {"model.adaptation_length": 2} if method == "grbal" else {}
+    config = headway.make_config("pendulum", method=method, preset="smoke", settings=settings)
+    trainer = make_trainer(config)
+    data = [t for steps in (12, 1, 7) for t in episodes(steps=steps)]
+    for _, stats in trainer.fit(trainer.begin(), data, 0, jax.random.key(0)):
+        assert int(stats.updates) == trainer.num_updates(data)
 
 
 def test_a_head_that_wins_nothing_is_harmless():

@@ -289,6 +289,8 @@ class Controller:
         if not held:
             self._left = 0 if self.agent.model is None else self.agent.planner.horizon - 1
         elif self._left <= 0:
+            # No action leads from here to the next observation.
+            self._state = self._state._replace(acted=np.zeros_like(self._state.acted))
             raise PlanningError(
                 f"{reason}, and no earlier plan is left, allowed: to hold to a plan for at most"
                 " planner.horizon - 1 steps; stop the robot, then call reset()."

@@ -5,8 +5,9 @@ One vector environment and one compiled agent serve collection and evaluation al
 
 import contextlib
 import dataclasses
+import operator
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 import jax
@@ -197,8 +198,7 @@ class PlannerUse:
     """Of the timed steps."""
 
     def __add__(self, other: "PlannerUse") -> "PlannerUse":
-        mine, others = dataclasses.astuple(self), dataclasses.astuple(other)
-        return PlannerUse(*(a + b for a, b in zip(mine, others, strict=True)))
+        return PlannerUse(*map(operator.add, dataclasses.astuple(self), dataclasses.astuple(other)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -366,7 +366,8 @@ class _ValidityFilter:
                 f"{self._name} returned {what} of shape {values.shape} and type {values.dtype} at"
                 f" step {step}, allowed: numbers of shape {instead.shape}; correct the environment."
             )
-        bad = ~np.isfinite(values.reshape(len(values), -1)).all(1)
+        with np.errstate(over="ignore"):  # too large for float32 is as bad
+            bad = ~np.isfinite(values.astype(np.float32).reshape(len(values), -1)).all(1)
         for row in np.flatnonzero(bad).tolist():
             where = f"a non-finite {what} at step {step} under {self._physics[row]}"
             self._note(row, f"{self._name} returned {where}")
@@ -397,13 +398,20 @@ class Batches:
         """Most episodes that may be left out."""
         return getattr(self.config, self.phase).max_bad_episodes
 
-    def run(self, name: str, episodes: Sequence[Episode], policy: Callable[[], Policy]) -> Rollout:
+    def run(
+        self,
+        name: str,
+        episodes: Sequence[Episode],
+        policy: Callable[[], Policy],
+        counted: Collection[int] | None = None,
+    ) -> Rollout:
         """Run a batch, unless it was finished before.
 
         Args:
             name: Of the batch.
             episodes: At most as many as there are environments.
             policy: Makes the policy that chooses the actions.
+            counted: Places of the episodes that must not break too often; all of them by default.
 
         Raises:
             BadEnvironmentError: More episodes broke than allowed, or the environment raised.
@@ -414,10 +422,12 @@ class Batches:
         else:
             rollout = Rollout.from_part(*kept)
             self.on_step(len(episodes) * self.environments.episode_length)
-        self.reasons += rollout.invalid.values()
+        invalid = rollout.invalid.items()
+        broken = [reason for place, reason in invalid if counted is None or place in counted]
+        self.reasons += broken
         if len(self.reasons) > self.allowed:
             raise self.too_many()
-        for reason in rollout.invalid.values():
+        for reason in broken:
             self.say(f"{reason}; the episode is dropped.")
         if rollout.use.failures and not self.failures:
             tried = rollout.use.steps * self.config.planner.num_iterations

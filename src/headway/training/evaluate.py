@@ -179,15 +179,15 @@ def run_tests(
     begin(sum(map(len, chunks.values())) * environments.episode_length)
     for chunk, batch in chunks.items():
         chunk_key = jax.random.fold_in(key, chunk)
-        ours = [episode for group, _, episode in batch if group in wanted]
+        ours = [place for place, (group, *_) in enumerate(batch) if group in wanted]
         # Every place has draws of its own, so the episodes that are wanted keep theirs.
-        episodes = [episode if group in wanted else ours[0] for group, _, episode in batch]
+        episodes = [batch[place if place in ours else ours[0]][2] for place in range(len(batch))]
         policy = partial(agent_policy, agent, size, episodes, key=chunk_key)
-        rollout = batches.run(f"evaluate-{chunk}", episodes, policy)
+        rollout = batches.run(f"evaluate-{chunk}", episodes, policy, ours)
         use, seconds = use + rollout.use, seconds + rollout.seconds
         for place, trajectory in rollout.episodes.items():
             group, number, _ = batch[place]
-            if group in wanted:
+            if place in ours:
                 found[group][number] = trajectory
     if not all(found.values()):
         if batches.partial:  # when the environment is mended, they are run again
@@ -245,7 +245,7 @@ def evaluate(
         added = {name: [usual[name]] for name in sim_params if name not in sets.names}
         known = {**sets.train, **added}
         custom = known | {name: np.atleast_1d(v) for name, v in sim_params.items()}
-        unseen = {group: {**known, **values} for group, values in sets.unseen.items()}
+        unseen = {group: {**values, **added} for group, values in sets.unseen.items()}
         physics = {"train": known, "unseen": {**unseen, CUSTOM: custom}}
         config, groups = override(config, {"sim_params": physics}), [*(groups or ()), CUSTOM]
     with closing(Environments.make(config)) as environments, progress or Progress() as shown:

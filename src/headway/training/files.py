@@ -90,7 +90,7 @@ def write_bytes(path: Path, content: bytes) -> None:
         RunError: Something else than a regular file has this name, or it cannot be written.
     """
     check_target(path)
-    temporary = path.with_name(f".{path.name}{UNFINISHED}")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}{UNFINISHED}")  # others may write it
     try:
         with writing(path):
             make_dir(path.parent)
@@ -167,6 +167,7 @@ def new_folder(path: Path) -> Iterator[Path]:
     with writing(path):
         yield unfinished
         unfinished.rename(path)
+        _sync_dir(path.parent)
 
 
 @contextlib.contextmanager

@@ -16,12 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from headway.config import Config
-from headway.data import Trajectory
+from headway.data import Trajectory, sim_params_row
 from headway.errors import ConfigError, HeadwayError, check_names, needs, one_line
 from headway.task import Task, env_action, episode_length, scaled_action, sim_param_sets, task_of
 from headway.training.check import compared, method_findings
 from headway.training.collect import Environments
 from headway.training.files import new_folder
+from headway.training.methods import told_sim_params
 from headway.training.run import RunDir, trajectories_digest
 
 Data = str | Path | Iterable[Mapping[str, Any]]
@@ -94,6 +95,8 @@ def read_log(data: Data, config: Config, held_out: float, names: Mapping[str, st
         )
     rows = _Rows(*map(np.concatenate, zip(*tables, strict=True)))
     pieces = _pieces(rows, physics, task, episode_length(config))
+    for piece in pieces:
+        sim_params_row(piece.sim_params, told_sim_params(config))
     remarks = []
     if cut_at:
         remarks.append(f"cut at {cut_at}: {len(recordings)} recordings, {len(pieces)} pieces.")

@@ -26,6 +26,7 @@ import io
 import json
 import platform
 import re
+import shutil
 import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -356,23 +357,21 @@ class RunDir:
         self._read(["config.json", name], number)
         return tree_from_arrays(template, load_arrays(self.path / name)[0], self.path / name)
 
-    def iteration_data(self, iteration: int) -> list[Trajectory]:
-        """The trajectories that an iteration collected.
+    def load_data(self, until: int | None = None) -> list[Trajectory]:
+        """All trajectories that were collected up to an iteration, the newest by default.
 
         Raises:
-            RunError: Their file is missing or damaged.
+            RunError: A file of them is missing or damaged.
         """
-        path = self.path / _name("data", iteration)
-        arrays, facts = load_arrays(path)
-        with reading(path):
-            return trajectories_from(arrays, facts)
-
-    def load_data(self, until: int | None = None) -> list[Trajectory]:
-        """All trajectories that were collected up to an iteration, the newest by default."""
         finished = self.finished_iterations if until is None else until + 1
         known = self._checksums(self.finished_iterations - 1)  # fits of recordings collect nothing
-        collected = [i for i in range(finished) if _name("data", i) in known]
-        return [t for i in collected for t in self.iteration_data(i)]
+        found: list[Trajectory] = []
+        for name in [_name("data", i) for i in range(finished) if _name("data", i) in known]:
+            self._read([name])
+            arrays, facts = load_arrays(self.path / name)
+            with reading(self.path / name):
+                found += trajectories_from(arrays, facts)
+        return found
 
     def tests(self) -> dict[str, list[Trajectory]]:
         """The test episodes of the newest iteration by group; empty if there were none.
@@ -576,8 +575,11 @@ class RunDir:
             for iteration in self._numbers(folder):
                 if last >= 0 and iteration not in kept:
                     remove(self.path / _name(folder, iteration))
-        for path in self.path.rglob(f".*{UNFINISHED}"):
-            remove(path)
+        for path in list(self.path.rglob(f".*{UNFINISHED}")):
+            if path.is_dir():  # of a command that wrote a folder into the run's
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                remove(path)
 
 
 class Partial:
@@ -645,9 +647,10 @@ def trajectory_arrays(trajectories: Sequence[Trajectory]) -> tuple[Arrays, dict[
 
 
 def trajectories_digest(trajectories: Sequence[Trajectory]) -> str:
-    """SHA-256 of all their arrays."""
-    arrays, _ = trajectory_arrays(trajectories)
-    return hashlib.sha256(b"".join(array.tobytes() for array in arrays.values())).hexdigest()
+    """SHA-256 of all that they hold."""
+    arrays, facts = trajectory_arrays(trajectories)
+    parts = [array.tobytes() for array in arrays.values()]
+    return hashlib.sha256(b"".join([json.dumps(facts).encode(), *parts])).hexdigest()
 
 
 def trajectories_from(arrays: Arrays, facts: Mapping[str, Any]) -> list[Trajectory]:

@@ -1,7 +1,6 @@
 """The training loop: collect, fit, evaluate, save, and again (supplement A.2)."""
 
 import dataclasses
-import shutil
 import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -29,7 +28,14 @@ from headway.training.collect import (
     random_policy,
 )
 from headway.training.evaluate import Tests, iteration_keys, run_tests
-from headway.training.files import new_folder, tree_arrays, tree_from_arrays
+from headway.training.files import (
+    UNFINISHED,
+    new_folder,
+    reading,
+    tree_arrays,
+    tree_from_arrays,
+    write_bytes,
+)
 from headway.training.progress import Progress
 from headway.training.recordings import HELD_OUT, Log
 from headway.training.run import LOCK, RunDir
@@ -122,9 +128,13 @@ def continued(run_dir: str | Path) -> Config:
 def copy_run(run_dir: Path, to: Path) -> None:
     """Copy a run, to go on with the copy; where there is something already, that is kept."""
     if not to.exists():
+        names = {path.relative_to(run_dir) for path in run_dir.rglob("*") if path.is_file()}
         with new_folder(to) as folder:
-            left = shutil.ignore_patterns("partial", "figures", LOCK)
-            shutil.copytree(run_dir, folder, ignore=left)
+            for name in sorted(names):
+                if name.parts[0] not in ("partial", "figures", LOCK) and name.suffix != UNFINISHED:
+                    with reading(run_dir / name):
+                        content = (run_dir / name).read_bytes()
+                    write_bytes(folder / name, content)
 
 
 @dataclasses.dataclass
@@ -182,7 +192,9 @@ class _Training:
                 for group, found in tested.items()
             }
             if self.log:
-                metrics["held_out_error"] = [float(e) for e in errors.get(HELD_OUT, ())]
+                # JSON knows no infinity; a fit whose imagination explodes is to be saved as well.
+                held_out, huge = errors.get(HELD_OUT, ()), float(np.finfo(np.float32).max)
+                metrics["held_out_error"] = np.nan_to_num(held_out, nan=huge, posinf=huge).tolist()
             shares = trainer.head_shares(self.state, self.data)
             tables = {
                 "evaluation.csv": [row.to_csv() for row in tests.rows(config, iteration)],

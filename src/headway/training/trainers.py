@@ -75,7 +75,11 @@ class Trainer:
             trajectories: All data so far.
         """
         fitting = self.config.fitting
-        return max(fitting.epochs, -(-fitting.min_updates // self.num_batches(trajectories)))
+        return max(fitting.epochs, -(-fitting.min_updates // self.num_updates(trajectories)))
+
+    def num_updates(self, trajectories: Sequence[Trajectory]) -> int:
+        """Updates in one pass over the data."""
+        return self.num_batches(trajectories)
 
     def num_batches(self, trajectories: Sequence[Trajectory]) -> int:
         """Batches in one pass over the data."""
@@ -185,13 +189,17 @@ class Fitted(Trainer):
         With `collection.min_steps` nobody knows how many episodes there will be, nor how long;
         then sizes double when they must.
         """
+        return self._padded(trajectories, *self._capacity(trajectories))
+
+    def _capacity(self, trajectories: Sequence[Trajectory]) -> tuple[int, int]:
+        """Episodes, and steps of each, that all data are padded to."""
         collection, length = self.config.collection, episode_length(self.config)
         capacity = max(collection.num_iterations * collection.num_episodes, len(trajectories))
         if collection.min_steps:
             longest = max(map(len, trajectories))
             length = min(length, max(64, 2 ** (longest - 1).bit_length()))
             capacity = max(capacity, 2 ** (len(trajectories) - 1).bit_length())
-        return self._padded(trajectories, capacity, length)
+        return capacity, length
 
     def _padded(self, trajectories: list[Trajectory], capacity: int, length: int) -> Episodes:
         sizes = capacity, length, self.names
@@ -305,6 +313,12 @@ class GradientAdaptedTrainer(Fitted):
         """See `Trainer.init`."""
         return self.begin_with(ReluNet.init(self.config.model, self.task, key=key))
 
+    def num_updates(self, trajectories: Sequence[Trajectory]) -> int:
+        """See `Trainer.num_updates`; `meta_epoch` fills its batches with whole tasks."""
+        seen = 2 * self.inner_step["length"]
+        num_tasks = max(1, self.config.fitting.batch_size // seen)
+        return max(1, sum(map(len, trajectories)) // (seen * num_tasks))
+
     def epoch(self, iteration, key):
         """See `Fitted.epoch`."""
         return partial(meta_epoch, **self.inner_step), key, key
@@ -320,6 +334,11 @@ class RecurrentTrainer(Fitted):
     def init(self, key: PRNGKeyArray) -> TrainState:
         """See `Trainer.init`."""
         return self.begin_with(RecurrentNet.init(self.config.model, self.task, key=key))
+
+    def num_updates(self, trajectories: Sequence[Trajectory]) -> int:
+        """See `Trainer.num_updates`; `recurrent_epoch` fills its batches with whole episodes."""
+        _, length = self._capacity(trajectories)
+        return -(-len(trajectories) // max(1, self.config.fitting.batch_size // length))
 
     def epoch(self, iteration, key):
         """See `Fitted.epoch`."""
