@@ -200,8 +200,8 @@ def planners(path: Path, figure: Path | None, reference: Path | None) -> None:
         return
     envs = list(dict.fromkeys(table.env))
     caption = (
-        "Share of the way from random actions to the paper's planner, same model, same episodes."
-        " Filled: training physics; hollow: unseen. Line: 97 %."
+        "Mean return with the same models in the same episodes. Filled and solid: training physics;"
+        " hollow and dashed: unseen. Lines: 97 % of the way from random actions to the paper's."
     )
     title = "Return against networks evaluated per step"
     rows, columns = -(-len(envs) // 3), min(3, len(envs))
@@ -209,16 +209,18 @@ def planners(path: Path, figure: Path | None, reference: Path | None) -> None:
     with figures.figure(figure, title=title, caption=caption, size=size) as drawing:
         panels = drawing.subplots(rows, columns, squeeze=False).flat
         for axes, env in zip(panels, envs, strict=False):
-            axes.axhline(0.97, color=figures.FAINT, lw=1.0)
+            for physics, style in (("training", "-"), ("unseen", "--")):
+                low, high = means.loc[(env, physics), [names[0], "paper"]]
+                axes.axhline(low + 0.97 * (high - low), color=figures.FAINT, lw=1.0, ls=style)
             for color, name in zip((*COLORS[1:], "k"), names[1:], strict=False):
                 for physics, fill in (("training", "full"), ("unseen", "none")):
                     label = name if (env, physics) == (envs[0], "training") else None
                     style = {"color": color, "fillstyle": fill, "ls": "", "label": label}
                     place = (env, physics), name
-                    axes.plot(cost.loc[place], share.loc[place], "o", ms=6, **style)
+                    axes.plot(cost.loc[place], means.loc[place], "o", ms=6, **style)
             axes.set_xscale("log")
             axes.set_title(env)
-            figures.numbers(axes, y="share")
+            figures.numbers(axes, y="return")
             axes.set_xlabel("network evaluations per step")
             axes.xaxis.set_major_formatter("{x:,.0f}")
         drawing.legend(loc="outside right center", fontsize=8)
