@@ -144,7 +144,7 @@ def meta_epoch(
         key: Draws the tasks.
     """
     config, samples, lengths = setup.config, data.samples, data.episodes.length
-    num_tasks = max(1, config.batch_size // (2 * length))
+    num_tasks = tasks_per_update(config.batch_size, length)
     num_updates = jnp.maximum(samples.count // (2 * length * num_tasks), 1)
 
     def update(i, state):
@@ -160,6 +160,11 @@ def meta_epoch(
         return state, loss, loss, skipped
 
     return run_updates(state, num_updates, update)
+
+
+def tasks_per_update(batch_size: int, length: int) -> int:
+    """Tasks whose pasts and futures, each of so many transitions, fill a batch."""
+    return max(1, batch_size // (2 * length))
 
 
 def window(

@@ -144,7 +144,7 @@ def recurrent_epoch(
     """
     episodes, config = data.episodes, setup.config
     capacity, length = episodes.action.shape[:2]
-    size = max(1, config.batch_size // length)
+    size = episodes_per_update(config.batch_size, length)
     draws = jax.random.uniform(key, (capacity,))
     order = jnp.argsort(jnp.where(jnp.arange(capacity) < episodes.count, draws, jnp.inf))
     order = jnp.pad(order, (0, -capacity % size))
@@ -160,6 +160,11 @@ def recurrent_epoch(
         return state, loss, loss, skipped
 
     return run_updates(state, -(-episodes.count // size), update)
+
+
+def episodes_per_update(batch_size: int, length: int) -> int:
+    """Whole episodes, padded to a length, that fill a batch."""
+    return max(1, batch_size // length)
 
 
 class ReBAL(Model):

@@ -179,9 +179,10 @@ def run_tests(
     begin(sum(map(len, chunks.values())) * environments.episode_length)
     for chunk, batch in chunks.items():
         chunk_key = jax.random.fold_in(key, chunk)
-        ours = [place for place, (group, *_) in enumerate(batch) if group in wanted]
+        ours = {i: episode for i, (group, _, episode) in enumerate(batch) if group in wanted}
+        spare = next(iter(ours.values()))
         # Every place has draws of its own, so the episodes that are wanted keep theirs.
-        episodes = [batch[place if place in ours else ours[0]][2] for place in range(len(batch))]
+        episodes = [ours.get(place, spare) for place in range(len(batch))]
         policy = partial(agent_policy, agent, size, episodes, key=chunk_key)
         rollout = batches.run(f"evaluate-{chunk}", episodes, policy, ours)
         use, seconds = use + rollout.use, seconds + rollout.seconds

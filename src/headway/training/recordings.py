@@ -95,8 +95,6 @@ def read_log(data: Data, config: Config, held_out: float, names: Mapping[str, st
         )
     rows = _Rows(*map(np.concatenate, zip(*tables, strict=True)))
     pieces = _pieces(rows, physics, task, episode_length(config))
-    for piece in pieces:
-        sim_params_row(piece.sim_params, told_sim_params(config))
     remarks = []
     if cut_at:
         remarks.append(f"cut at {cut_at}: {len(recordings)} recordings, {len(pieces)} pieces.")
@@ -110,6 +108,7 @@ def read_log(data: Data, config: Config, held_out: float, names: Mapping[str, st
     out = order[: min(max(round(held_out * len(order)), held_out > 0), len(order) - 1)]
     parts: tuple[list[Trajectory], list[Trajectory]] = [], []
     for unit, piece in zip(units, pieces, strict=True):
+        sim_params_row(piece.sim_params, told_sim_params(config))  # none is missing
         parts[unit in out].append(piece)
         recording = recordings[int(piece.sim_params[RECORDING])]
         recording["pieces"] += 1

@@ -28,14 +28,7 @@ from headway.training.collect import (
     random_policy,
 )
 from headway.training.evaluate import Tests, iteration_keys, run_tests
-from headway.training.files import (
-    UNFINISHED,
-    new_folder,
-    reading,
-    tree_arrays,
-    tree_from_arrays,
-    write_bytes,
-)
+from headway.training.files import new_folder, reading, tree_arrays, tree_from_arrays, write_bytes
 from headway.training.progress import Progress
 from headway.training.recordings import HELD_OUT, Log
 from headway.training.run import LOCK, RunDir
@@ -131,7 +124,7 @@ def copy_run(run_dir: Path, to: Path) -> None:
         names = {path.relative_to(run_dir) for path in run_dir.rglob("*") if path.is_file()}
         with new_folder(to) as folder:
             for name in sorted(names):
-                if name.parts[0] not in ("partial", "figures", LOCK) and name.suffix != UNFINISHED:
+                if name.parts[0] not in ("partial", "figures", LOCK):
                     with reading(run_dir / name):
                         content = (run_dir / name).read_bytes()
                     write_bytes(folder / name, content)

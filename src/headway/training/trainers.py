@@ -35,10 +35,10 @@ from headway.models.fitting import (
     fit_epoch,
     make_data,
 )
-from headway.models.grbal import GrBAL, ReluNet, meta_epoch
+from headway.models.grbal import GrBAL, ReluNet, meta_epoch, tasks_per_update
 from headway.models.last_layer_prior import fit_prior
 from headway.models.multi_headed import MultiHeadModel, MultiHeadNet
-from headway.models.rebal import ReBAL, RecurrentNet, recurrent_epoch
+from headway.models.rebal import ReBAL, RecurrentNet, episodes_per_update, recurrent_epoch
 from headway.models.statistics import Statistics
 from headway.planning.agent import Agent
 from headway.task import episode_length, sim_param_sets, task_of
@@ -315,9 +315,9 @@ class GradientAdaptedTrainer(Fitted):
 
     def num_updates(self, trajectories: Sequence[Trajectory]) -> int:
         """See `Trainer.num_updates`; `meta_epoch` fills its batches with whole tasks."""
-        seen = 2 * self.inner_step["length"]
-        num_tasks = max(1, self.config.fitting.batch_size // seen)
-        return max(1, sum(map(len, trajectories)) // (seen * num_tasks))
+        length = self.inner_step["length"]
+        seen = 2 * length * tasks_per_update(self.config.fitting.batch_size, length)
+        return max(1, sum(map(len, trajectories)) // seen)
 
     def epoch(self, iteration, key):
         """See `Fitted.epoch`."""
@@ -338,7 +338,7 @@ class RecurrentTrainer(Fitted):
     def num_updates(self, trajectories: Sequence[Trajectory]) -> int:
         """See `Trainer.num_updates`; `recurrent_epoch` fills its batches with whole episodes."""
         _, length = self._capacity(trajectories)
-        return -(-len(trajectories) // max(1, self.config.fitting.batch_size // length))
+        return -(-len(trajectories) // episodes_per_update(self.config.fitting.batch_size, length))
 
     def epoch(self, iteration, key):
         """See `Fitted.epoch`."""
