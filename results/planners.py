@@ -17,7 +17,8 @@ import numpy as np
 
 from headway.config import override
 from headway.models.compilation import prepare_jax
-from headway.training.collect import Environments, agent_policy, random_policy, run_episodes
+from headway.training.collect import agent_policy, random_policy, run_episodes
+from headway.training.environments import Environments
 from headway.training.evaluate import PlanningCost, group_episodes
 from headway.training.run import RunDir, format_sim_params
 from headway.training.trainers import load_agent

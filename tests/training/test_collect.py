@@ -12,7 +12,8 @@ from headway import task
 from headway.errors import BadEnvironmentError
 from headway.sim_params import SimParamSets
 from headway.task import EnvSpec, register
-from headway.training.collect import Batches, Choice, Environments, Episode
+from headway.training.collect import Batches, Choice, Episode
+from headway.training.environments import Environments
 from headway.training.run import RunDir
 from headway.training.train import train_run
 from headway.worlds.classic import PendulumTask

@@ -15,7 +15,7 @@ from headway.config import PlannerConfig
 from headway.envs.vector import read_spaces
 from headway.errors import BadEnvironmentError, RunError
 from headway.planning.agent import Agent
-from headway.training.collect import Environments
+from headway.training.environments import Environments
 
 OBS = Box(-np.inf, np.inf, (3,), np.float64)
 SPACES = {

@@ -10,7 +10,7 @@ from headway.data import Trajectory
 from headway.errors import ConfigError, DivergenceError, UnknownNameError
 from headway.models.fitting import EpochStats
 from headway.training import train
-from headway.training.collect import Environments
+from headway.training.environments import Environments
 from headway.training.run import RunDir
 from headway.training.trainers import make_trainer
 

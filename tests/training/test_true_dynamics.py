@@ -17,7 +17,7 @@ from headway.lab.figures import save_run_figures
 from headway.models.simulator import ClassicSimulator, EnvSimulator
 from headway.planning.rollouts import candidate_returns
 from headway.task import env_action, env_spec
-from headway.training.collect import Environments
+from headway.training.environments import Environments
 from headway.training.methods import make_config
 from headway.training.trainers import make_trainer
 

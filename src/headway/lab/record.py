@@ -21,7 +21,7 @@ from headway.lab.figures import FAINT, HEADS, INK
 from headway.lab.tables import full_label
 from headway.planning.controller import Controller
 from headway.task import episode_length
-from headway.training.collect import Environments, raising
+from headway.training.environments import Environments, raising
 from headway.training.files import check_target, write_bytes
 from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress

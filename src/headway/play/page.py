@@ -20,7 +20,7 @@ from headway.config import OPTIMIZERS
 from headway.errors import BadEnvironmentError, ConfigError, needs
 from headway.play.player import REMEMBERED, Player
 from headway.sim_params import Uniform
-from headway.training.collect import raising
+from headway.training.environments import raising
 from headway.training.methods import KEEP_LEARNING
 from headway.worlds.classic import CartPoleSwingUp
 from headway.worlds.rendering import BODY, CART, GRID, HEADS, INK

@@ -15,7 +15,7 @@ from headway.config import LARGEST, override
 from headway.errors import BadEnvironmentError, HeadwayError, PlanningError
 from headway.sim_params import Uniform
 from headway.task import env_spec
-from headway.training.collect import Environments, raising
+from headway.training.environments import Environments, raising
 from headway.training.run import RunDir
 
 REMEMBERED = 200

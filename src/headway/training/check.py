@@ -16,7 +16,8 @@ from headway.data import Trajectory
 from headway.errors import BadEnvironmentError, HeadwayError, did_you_mean, one_line
 from headway.models.compilation import prepare_jax
 from headway.task import EnvSpec, Task, name_spec
-from headway.training.collect import Environments, Episode, random_policy, run_episodes
+from headway.training.collect import Episode, random_policy, run_episodes
+from headway.training.environments import Environments
 from headway.training.methods import make_config
 
 TRANSITIONS = 200  # of one long episode, and about as many of short ones under all physics

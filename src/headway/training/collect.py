@@ -3,29 +3,24 @@
 One vector environment and one compiled agent serve collection and evaluation alike.
 """
 
-import contextlib
 import dataclasses
 import operator
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, Self
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Float, Int, PRNGKeyArray
 
-from headway.config import LARGEST, Config, differences
+from headway.config import Config
 from headway.data import Trajectory
-from headway.errors import BadEnvironmentError, HeadwayError, one_line, shown
+from headway.errors import BadEnvironmentError, one_line
 from headway.planning.agent import Agent
-from headway.sim_params import SimParamSets
-from headway.spaces import Spaces
-from headway.task import Task, env_action, env_options, episode_length, sim_param_sets, task_of
+from headway.task import env_action
+from headway.training.environments import Environments, raising
 from headway.training.files import Arrays
 from headway.training.run import Partial, trajectories_from, trajectory_arrays
-
-if TYPE_CHECKING:
-    from headway.envs import HeadwayVectorEnv
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,102 +29,6 @@ class Episode:
 
     sim_params: dict[str, float]
     seed: int
-
-
-@dataclasses.dataclass(frozen=True)
-class Environments:
-    """The vector environment that a run acts in, and its Task."""
-
-    name: str
-    """Short name of the environment."""
-    task: Task
-    vector: "HeadwayVectorEnv"
-    sim_params: SimParamSets
-    episode_length: int
-
-    @classmethod
-    def make(cls, config: Config, *, single: bool = False, film: bool = False) -> "Environments":
-        """Make as many as a configuration collects episodes, or a single one in this process.
-
-        One for a film can be drawn; it runs in a process of its own where the others do.
-
-        Raises:
-            BadEnvironmentError: It cannot be made, its spaces do not fit its Task or its run, or
-                no plan is made in such spaces.
-        """
-        from headway import envs  # a controller is loaded without a simulator
-
-        collection, options = config.collection, env_options(config)
-        sim_params, apart = sim_param_sets(config), collection.env_processes and not single
-        with raising(config.env, "creation" + film * " with render_mode, to be filmed"):
-            vector = envs.make_vec(
-                config.env,
-                1 if single or film else collection.num_episodes,
-                sim_params=sim_params,
-                options=options,
-                episode_length=episode_length(config),
-                step_timeout_s=collection.step_timeout_s if apart else None,
-                render_mode="rgb_array" if film else None,
-            )
-        try:
-            task = _task_in(config, vector.spaces)
-        except Exception:
-            vector.close()
-            raise
-        return cls(config.env, task, vector, sim_params, episode_length(config))
-
-    def frame(self) -> UInt8[np.ndarray, "height width 3"]:
-        """Draw the first environment.
-
-        Raises:
-            BadEnvironmentError: It gave no picture.
-        """
-        image: Any = next(iter(self.vector.render() or ()), None)
-        kind = getattr(image, "dtype", type(image).__name__)
-        if kind != np.uint8 or image.ndim != 3:
-            raise BadEnvironmentError(
-                f"render() gave {kind}, allowed: an image of type uint8 and shape"
-                " [height, width, 3], as with render_mode='rgb_array'."
-            )
-        return image
-
-    def close(self) -> None:
-        """Free what the environments hold, and end their processes."""
-        with raising(self.name, "closing"):
-            self.vector.close()
-
-
-def _task_in(config: Config, read: Spaces) -> Task:
-    """The Task of a run, told the spaces of its environment; what it states itself counts.
-
-    Raises:
-        BadEnvironmentError: They contradict each other, or actions are not bounded.
-    """
-    task = task_of(dataclasses.replace(config, spaces=read))
-    low, high = tuple(task.action_low), tuple(task.action_high)
-    stated = task.obs_size, task.action_size, len(low), len(high)
-    found = read.obs_size, read.action_size, *2 * [len(read.action_low)]
-    if stated != found:
-        raise BadEnvironmentError(
-            f"the Task of {config.env} states {stated} as obs_size, action_size and numbers of"
-            f" bounds, but its environment has {found}; correct the Task, or let it state none."
-        )
-    width, whole = np.subtract(high, low), read.action_kind != "box"
-    widest = LARGEST if whole else np.finfo(np.float32).max
-    if not ((width + whole > 0) & (width <= widest)).all():
-        raise BadEnvironmentError(
-            f"the actions of {config.env} have action_low {shown(low)} and action_high"
-            f" {shown(high)}, allowed: finite bounds, the lower one first; correct the space, or"
-            " state both in the Task."
-        )
-    spaces = dataclasses.replace(read, action_low=low, action_high=high)
-    told = dataclasses.replace(config, spaces=spaces)
-    if config.spaces and (changed := differences(config, told)):
-        raise BadEnvironmentError(
-            f"{config.env} has other spaces than its run ({'; '.join(changed)}); bring them back,"
-            " or train another run."
-        )
-    return task_of(told)
 
 
 class Choice(NamedTuple):
@@ -160,15 +59,14 @@ def random_policy(environments: Environments, rng: np.random.Generator) -> Polic
 
 
 def agent_policy(
-    agent: Agent, num_envs: int, episodes: Sequence[Episode], *, key: PRNGKeyArray
+    agent: Agent, num_envs: int, episodes: Sequence[Episode | None], *, key: PRNGKeyArray
 ) -> Policy:
     """An agent that remembers each environment; it starts with an empty memory.
 
     Args:
         agent: The agent.
         num_envs: Environments of the batch.
-        episodes: What they run, for an agent that is told the physics; surplus environments
-            repeat the last episode.
+        episodes: What they run, as in `run_episodes`, for an agent that is told the physics.
         key: The planner's draws.
     """
     physics = [episode.sim_params for episode in fill(episodes, num_envs)]
@@ -228,15 +126,15 @@ class Rollout:
 
 def run_episodes(
     environments: Environments,
-    episodes: Sequence[Episode],
+    episodes: Sequence[Episode | None],
     policy: Policy,
     on_step: Callable[[int], None] = lambda steps: None,
 ) -> Rollout:
     """Run at most one episode in each environment of the batch, side by side.
 
     Args:
-        environments: Surplus ones repeat the last episode and are dropped.
-        episodes: Physics and seeds, at most as many as there are environments.
+        environments: Where they run; one that has no episode repeats the first and is dropped.
+        episodes: Physics and seeds by place, at most as many as there are environments.
         policy: Chooses the actions.
         on_step: Called after each step with the number of environments that stepped.
 
@@ -247,8 +145,10 @@ def run_episodes(
         BadEnvironmentError: The environment raised, or returned something misshapen.
     """
     begun = time.perf_counter()
-    wanted, vector = len(episodes), environments.vector
+    vector = environments.vector
     filled = fill(episodes, vector.num_envs)
+    asked = {row: episode for row, episode in enumerate(episodes) if episode}
+    wanted = np.isin(np.arange(len(filled)), [*asked])
     seeds: Any = [episode.seed for episode in filled]
     physics = [episode.sim_params for episode in filled]
     columns = {name: np.array([one[name] for one in physics]) for name in physics[0]}
@@ -266,12 +166,12 @@ def run_episodes(
         started = time.perf_counter()
         choice = policy(obs)
         seconds = time.perf_counter() - started
-        planned = running[:wanted]
+        planned = running & wanted
         timed = step > 1  # the first one may compile
         use += PlannerUse(
             int(planned.sum()),
-            int(choice.failures[:wanted][planned].sum()),
-            int(choice.evaluations[:wanted][planned].sum()),
+            int(choice.failures[planned].sum()),
+            int(choice.evaluations[planned].sum()),
             timed * len(filled),
             timed * seconds,
         )
@@ -285,8 +185,8 @@ def run_episodes(
         length += running
         terminated |= running & ends
         running &= ~(ends | cut)
-        on_step(wanted)
-        if not running[:wanted].any():
+        on_step(len(asked))
+        if not running[wanted].any():
             break
     table = np.stack(observations, 1), np.stack(actions, 1), np.stack(rewards, 1)
     trajectories = {
@@ -297,36 +197,17 @@ def run_episodes(
             sim_params=episode.sim_params,
             terminated=bool(terminated[row]),
         )
-        for row, episode in enumerate(episodes)
+        for row, episode in asked.items()
         if row not in valid.reasons
     }
-    invalid = {row: valid.reasons[row] for row in sorted(valid.reasons) if row < wanted}
+    invalid = {row: valid.reasons[row] for row in asked if row in valid.reasons}
     return Rollout(trajectories, use, invalid, time.perf_counter() - begun)
 
 
-@contextlib.contextmanager
-def raising(name: str, when: str) -> Iterator[None]:
-    """Turn whatever the environment `name` raises into one line that says when.
-
-    Raises:
-        BadEnvironmentError: It raised.
-    """
-    try:
-        yield
-    except BadEnvironmentError as error:
-        raise BadEnvironmentError(f"{name} at {when}: {error}") from error
-    except HeadwayError:
-        raise
-    except Exception as error:
-        raise BadEnvironmentError(
-            f"{name} raised {type(error).__name__} at {when}: {one_line(error, 300)}; correct the"
-            " environment, then the same command goes on."
-        ) from error
-
-
-def fill(episodes: Sequence[Episode], num_envs: int) -> list[Episode]:
-    """Give every environment of a batch an episode; surplus ones repeat the last."""
-    return [*episodes, *[episodes[-1]] * (num_envs - len(episodes))]
+def fill(episodes: Sequence[Episode | None], num_envs: int) -> list[Episode]:
+    """Give every environment of a batch an episode; those without one repeat the first."""
+    first = next(filter(None, episodes))
+    return [episode or first for episode in (*episodes, *[None] * (num_envs - len(episodes)))]
 
 
 class _ValidityFilter:
@@ -401,17 +282,15 @@ class Batches:
     def run(
         self,
         name: str,
-        episodes: Sequence[Episode],
+        episodes: Sequence[Episode | None],
         policy: Callable[[], Policy],
-        counted: Collection[int] | None = None,
     ) -> Rollout:
         """Run a batch, unless it was finished before.
 
         Args:
             name: Of the batch.
-            episodes: At most as many as there are environments.
+            episodes: As in `run_episodes`.
             policy: Makes the policy that chooses the actions.
-            counted: Places of the episodes that must not break too often; all of them by default.
 
         Raises:
             BadEnvironmentError: More episodes broke than allowed, or the environment raised.
@@ -421,13 +300,12 @@ class Batches:
             rollout = run_episodes(self.environments, episodes, policy(), self.on_step)
         else:
             rollout = Rollout.from_part(*kept)
-            self.on_step(len(episodes) * self.environments.episode_length)
-        invalid = rollout.invalid.items()
-        broken = [reason for place, reason in invalid if counted is None or place in counted]
-        self.reasons += broken
+            asked = len(rollout.episodes) + len(rollout.invalid)
+            self.on_step(asked * self.environments.episode_length)
+        self.reasons += rollout.invalid.values()
         if len(self.reasons) > self.allowed:
             raise self.too_many()
-        for reason in broken:
+        for reason in rollout.invalid.values():
             self.say(f"{reason}; the episode is dropped.")
         if rollout.use.failures and not self.failures:
             tried = rollout.use.steps * self.config.planner.num_iterations

@@ -19,7 +19,8 @@ from headway.planning.agent import Agent
 from headway.planning.rollouts import plan_flop
 from headway.sim_params import SimParamSets
 from headway.task import Task, env_spec, sim_param_sets
-from headway.training.collect import Batches, Environments, Episode, PlannerUse, agent_policy
+from headway.training.collect import Batches, Episode, PlannerUse, agent_policy
+from headway.training.environments import Environments
 from headway.training.methods import config_to_evaluate
 from headway.training.progress import Progress
 from headway.training.run import EpisodeRow, Iteration, RunDir, format_sim_params
@@ -174,22 +175,19 @@ def run_tests(
     ]
     found: dict[str, dict[int, Trajectory]] = {group: {} for group in wanted}
     use, seconds = PlannerUse(), 0.0
-    chunks = dict(enumerate(asked[start : start + size] for start in range(0, len(asked), size)))
-    chunks = {c: batch for c, batch in chunks.items() if {*wanted} & {group for group, *_ in batch}}
-    begin(sum(map(len, chunks.values())) * environments.episode_length)
-    for chunk, batch in chunks.items():
-        chunk_key = jax.random.fold_in(key, chunk)
-        ours = {i: episode for i, (group, _, episode) in enumerate(batch) if group in wanted}
-        spare = next(iter(ours.values()))
+    begin(sum(group in wanted for group, *_ in asked) * environments.episode_length)
+    for chunk in range(-(-len(asked) // size)):
+        batch = asked[chunk * size : (chunk + 1) * size]
         # Every place has draws of its own, so the episodes that are wanted keep theirs.
-        episodes = [ours.get(place, spare) for place in range(len(batch))]
-        policy = partial(agent_policy, agent, size, episodes, key=chunk_key)
-        rollout = batches.run(f"evaluate-{chunk}", episodes, policy, ours)
+        episodes = [episode if group in wanted else None for group, _, episode in batch]
+        if not any(episodes):
+            continue
+        policy = partial(agent_policy, agent, size, episodes, key=jax.random.fold_in(key, chunk))
+        rollout = batches.run(f"evaluate-{chunk}", episodes, policy)
         use, seconds = use + rollout.use, seconds + rollout.seconds
         for place, trajectory in rollout.episodes.items():
             group, number, _ = batch[place]
-            if place in ours:
-                found[group][number] = trajectory
+            found[group][number] = trajectory
     if not all(found.values()):
         if batches.partial:  # when the environment is mended, they are run again
             batches.partial.remove("evaluate-*")

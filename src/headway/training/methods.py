@@ -327,7 +327,7 @@ def make_config(
 def _time_limit(spec: EnvSpec) -> int:
     """Steps after which Gymnasium cuts an episode of an environment."""
     from headway.envs.built_in import registered
-    from headway.training.collect import raising
+    from headway.training.environments import raising
 
     limit = None
     if isinstance(spec.env_id, str):

@@ -20,7 +20,7 @@ from headway.data import Trajectory, sim_params_row
 from headway.errors import ConfigError, HeadwayError, check_names, needs, one_line
 from headway.task import Task, env_action, episode_length, scaled_action, sim_param_sets, task_of
 from headway.training.check import compared, method_findings
-from headway.training.collect import Environments
+from headway.training.environments import Environments
 from headway.training.files import new_folder
 from headway.training.methods import told_sim_params
 from headway.training.run import RunDir, trajectories_digest

@@ -19,14 +19,8 @@ from headway.errors import DivergenceError
 from headway.models.fitting import EpochStats
 from headway.task import BUILT_IN, episode_length
 from headway.training.check import compared, refuse_faults
-from headway.training.collect import (
-    Batches,
-    Environments,
-    Episode,
-    Rollout,
-    agent_policy,
-    random_policy,
-)
+from headway.training.collect import Batches, Episode, Rollout, agent_policy, random_policy
+from headway.training.environments import Environments
 from headway.training.evaluate import Tests, iteration_keys, run_tests
 from headway.training.files import new_folder, reading, tree_arrays, tree_from_arrays, write_bytes
 from headway.training.progress import Progress

@@ -42,8 +42,8 @@ from headway.models.rebal import ReBAL, RecurrentNet, episodes_per_update, recur
 from headway.models.statistics import Statistics
 from headway.planning.agent import Agent
 from headway.task import episode_length, sim_param_sets, task_of
-from headway.training.collect import Environments
 from headway.training.diagnostics import prediction_error
+from headway.training.environments import Environments
 from headway.training.methods import told_sim_params
 from headway.training.run import Iteration, RunDir, format_sim_params
 
