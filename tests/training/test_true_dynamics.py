@@ -35,7 +35,8 @@ def every_physics(env):
 
 def begin(env, physics, *, steps=7):
     """Environments, one per physics, some random steps into an episode."""
-    settings = {"collection.num_episodes": len(physics), **SMALL}
+    count = {"collection.num_episodes": len(physics), "evaluation.num_episodes": len(physics)}
+    settings = {**count, **SMALL}
     config = make_config(env, method="true-dynamics", preset="smoke", settings=settings)
     environments = Environments.make(config)
     config = dataclasses.replace(config, spaces=environments.task.spaces)
@@ -59,6 +60,13 @@ def play(environments, sequence):
         actions = env_action(environments.task, sequence[:, step])
         total += environments.vector.step(actions)[1]
     return total
+
+
+def test_as_many_environments_as_tests_fill_at_most():
+    settings = {"collection.num_episodes": 50, "evaluation.num_episodes": 2}
+    for method, count in {"true-dynamics": 6, "random": 6, "tmcl": 50}.items():
+        config = make_config("pendulum", method=method, preset="smoke", settings=settings)
+        assert Environments.make(config).vector.num_envs == count
 
 
 @pytest.mark.parametrize("env", CLASSIC)

@@ -300,8 +300,7 @@ class Batches:
             rollout = run_episodes(self.environments, episodes, policy(), self.on_step)
         else:
             rollout = Rollout.from_part(*kept)
-            asked = len(rollout.episodes) + len(rollout.invalid)
-            self.on_step(asked * self.environments.episode_length)
+            self.on_step(sum(map(bool, episodes)) * self.environments.episode_length)
         self.reasons += rollout.invalid.values()
         if len(self.reasons) > self.allowed:
             raise self.too_many()

@@ -31,7 +31,7 @@ class Environments:
 
     @classmethod
     def make(cls, config: Config, *, single: bool = False, film: bool = False) -> "Environments":
-        """Make as many as a configuration collects episodes, or a single one in this process.
+        """Make as many as a configuration runs side by side, or a single one in this process.
 
         One for a film can be drawn; it runs in a process of its own where the others do.
 
@@ -41,14 +41,16 @@ class Environments:
         """
         from headway import envs  # a controller is loaded without a simulator
 
-        collection, options = config.collection, env_options(config)
-        sim_params, apart = sim_param_sets(config), collection.env_processes and not single
+        collection, sim_params = config.collection, sim_param_sets(config)
+        apart, count = collection.env_processes and not single, collection.num_episodes
+        if not config.model.learns:  # it only tests, and places without an episode cost as much
+            count = min(count, config.evaluation.num_episodes * len(sim_params.group_names))
         with raising(config.env, "creation" + film * " with render_mode, to be filmed"):
             vector = envs.make_vec(
                 config.env,
-                1 if single or film else collection.num_episodes,
+                1 if single or film else count,
                 sim_params=sim_params,
-                options=options,
+                options=env_options(config),
                 episode_length=episode_length(config),
                 step_timeout_s=collection.step_timeout_s if apart else None,
                 render_mode="rgb_array" if film else None,

@@ -259,8 +259,7 @@ def evaluate(
         order, begin = list(dict.fromkeys([*tested, *known])), partial(shown.phase, "evaluate")
         tests = run_tests(agent, wanted, order, batches, key, begin)
     cost = PlanningCost.of(tests.use, config, environments.task)
-    rows = tests.rows(config, number)
-    return Evaluation(rows, config, cost, tests.trajectories)
+    return Evaluation(tests.rows(config, number), config, cost, tests.trajectories)
 
 
 def known_groups(wanted: Sequence[str] | None, known: Sequence[str]) -> list[str]:
