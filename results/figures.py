@@ -1,7 +1,8 @@
 """Tables and figures of this folder, made from its CSV files.
 
     python results/figures.py scores results/pendulum-quick
-    python results/figures.py scores results/pendulum-quick --same-episodes results/ceilings
+    python results/figures.py scores results/pendulum-quick --references results/ceilings
+    python results/figures.py shares results/hopper-methods --references results/ceilings/hopper-200
     python results/figures.py returns results/cartpole-500-quick
     python results/figures.py arms results/adaptation/pendulum-quick NAME.png
     python results/figures.py changes results/adaptation/changes/pendulum NAME.png
@@ -9,8 +10,8 @@
     python results/figures.py learning results/half-cheetah-mass-1/pets.csv NAME.png
     python results/figures.py ceilings results/ceilings
 
-Tables are printed as Markdown; a PNG file is drawn where one is named. `scores` and `returns` take
-a folder of METHOD/seed-N, `arms` and `changes` one table per run, `planners` and
+Tables are printed as Markdown; a PNG file is drawn where one is named. `scores`, `shares` and
+`returns` take a folder of METHOD/seed-N, `arms` and `changes` one table per run, `planners` and
 `learning` one table.
 """
 
@@ -88,6 +89,27 @@ def scores(folder: Path, figure: Path | None, reference: Path | None) -> None:
     table.columns = ["each run", "mean"]
     order = by_run.xs("unseen", level="physics").groupby("arm").mean().sort_values(ascending=False)
     markdown(table.unstack("physics").swaplevel(axis=1).sort_index(axis=1).loc[order.index])
+
+
+def shares(folder: Path, figure: Path | None, reference: Path | None) -> None:
+    """Share of the way from random actions to the planner on the true dynamics, by run.
+
+    It is the mean over training physics. `reference` begins the names of what both earned.
+    """
+    assert reference is not None
+    tests = kept_tests(folder).query("physics == 'training'")
+    tests["sim_params"] = tests.sim_params.str.replace("damping_scale=1 ", "")
+    earned = tests.groupby(["arm", "run", "sim_params"])["return"].mean()
+    random, ceiling = (
+        pd.concat(map(pd.read_csv, reference.parent.glob(f"{reference.name}*-{name}.csv")))
+        .groupby("sim_params")["return"]
+        .mean()
+        for name in ("random", "true-dynamics")
+    )
+    share = earned.sub(random, level="sim_params").div(ceiling - random, level="sim_params")
+    by_run = share.groupby(["arm", "run"]).mean()
+    table = by_run.groupby("arm").agg([each, lambda v: f"{v.mean():.2f}"])
+    markdown(table.set_axis(["each run", "mean"], axis=1))
 
 
 def returns(folder: Path, figure: Path | None, reference: Path | None) -> None:
@@ -256,14 +278,15 @@ def ceilings(folder: Path, figure: Path | None, reference: Path | None) -> None:
 
 def main() -> None:
     """Print a table; draw a figure where a file is named."""
-    made = {f.__name__: f for f in (scores, returns, arms, changes, planners, learning, ceilings)}
+    tables = (scores, shares, returns, arms, changes, planners, learning, ceilings)
+    made = {table.__name__: table for table in tables}
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("what", choices=made)
     parser.add_argument("source", type=Path, help="folder or CSV file")
     parser.add_argument("figure", type=Path, nargs="?", help="PNG file to write")
-    parser.add_argument("--same-episodes", type=Path, metavar="CEILINGS")
+    parser.add_argument("--references", type=Path, help="folder or file names' start")
     asked = parser.parse_args()
-    made[asked.what](asked.source, asked.figure, asked.same_episodes)
+    made[asked.what](asked.source, asked.figure, asked.references)
 
 
 if __name__ == "__main__":

@@ -49,12 +49,16 @@ def test_what_is_timed_runs_at_a_small_size():
     ("words", "line"),
     [
         ("scores results/pendulum-quick", "| tmcl | 0.99 0.96 0.99 | 0.98 | 0.65 0.65 0.53 |"),
+        (
+            "shares results/hopper-methods --references results/ceilings/hopper-200",
+            "| tmcl | 1.27 1.13 1.15 | 1.19 |",
+        ),
         ("arms results/adaptation/pendulum-quick", "| tmcl | none | 0.99 0.96 0.99 (mean 0.98) |"),
         ("planners results/planners/six.csv", "| paper | -127 (100%) | -643 (100%) |"),
     ],
 )
 def test_tables_of_results_are_made_from_their_files(words, line, tmp_path):
-    figure = [] if words.startswith("scores") else [str(tmp_path / "figure.png")]
+    figure = [] if words.startswith(("scores", "shares")) else [str(tmp_path / "figure.png")]
     command = [sys.executable, "results/figures.py", *words.split(), *figure]
     done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT)
     assert line in done.stdout
