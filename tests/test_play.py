@@ -1,6 +1,7 @@
 """The live player: its loop without a page, the run that ships, and the page in a browser."""
 
 import itertools
+import re
 import threading
 from types import SimpleNamespace
 
@@ -277,6 +278,8 @@ def test_the_page_shows_and_changes_what_is_played(browser, served):
     assert tab.locator("canvas").first.is_visible()
     if player.spec.name == "pendulum":
         assert tab.locator(".heads rect").count() > 5
+    tab.get_by_role("button", name="reset").click()
+    tab.locator("p").filter(has_text=re.compile("^paused$")).wait_for()  # no step, no reward
     tab.close()
     assert not errors
 

@@ -192,7 +192,8 @@ class Page:
     def _words(self) -> str:
         player = self.player
         if not player.moments:
-            return f"Compiling the plan … {player.message}"
+            words = "**paused**" if player.paused else "Compiling the plan …"
+            return f"{words} {player.message}"
         newest, budget = player.moments[-1], 1e3 / (player.rate * player.speed)
         pace = "keeps up" if player.pace > 0.95 else f"**falls behind: {100 * player.pace:.0f} %**"
         words = f"planning {1e3 * newest.seconds:.1f} of {budget:.0f} ms, {pace}"
