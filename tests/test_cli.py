@@ -113,6 +113,8 @@ def test_wrong_usage_exits_2_and_says_what_there_is(capsys, calls, words, text):
         ("train hopper --env-options scale-inertia", "allowed: NAME=VALUE"),
         ("train pendulum --sim-params missing.json", "missing.json"),
         ("evaluate nowhere --json", "allowed: a run directory"),
+        ("evaluate --json RUN", "--json comes first, allowed: ENV or RUN, then options"),
+        ("train --seed 1 pendulum --preset quick", "--seed comes first, allowed: ENV"),
         (
             "evaluate RUN --sim-params length=1 length=2",
             "--sim-params is length=1 length=2, allowed",

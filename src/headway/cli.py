@@ -809,8 +809,11 @@ def parse(words: Sequence[str]) -> Command:
         return tyro.cli(commands, args=words, prog="headway", description=told, config=config)
     command, rest = COMMANDS[words[0]], words[1:]
     names, _ = tyro.cli(Names, args=rest, add_help=False, return_unknown_args=True)
-    named = names.task if command is Fit else names.words or names.from_run
+    named = {Fit: names.task, Train: names.words or names.from_run}.get(command, names.words)
     default = command().with_defaults(names) if named else command()
+    helped = {"-h", "--help", "--help-all"} & set(rest)
+    if rest and default.sections and not (named or helped or command is Fit):
+        raise ConfigError(f"{rest[0]} comes first, allowed: ENV or RUN, then options.")
     asked = functools.partial(tyro.cli, prog=f"headway {words[0]}", config=config)
     if {"-h", "--help"} & set(rest) and default.sections:
         default = dataclasses.replace(

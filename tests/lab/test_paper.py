@@ -68,6 +68,11 @@ def test_a_sweep_has_an_arm_per_method_and_combination():
     assert arms[3] == Arm("pets, planner.horizon 10, fitting.epochs 1", "pets", chosen)
 
 
+def test_returns_while_learning_are_of_methods_that_learn():
+    arms = {arm.label for arm in EXPERIMENTS["fig9"].arms}
+    assert {*METHODS} - arms == {"random", "true-dynamics"}
+
+
 def test_what_is_unknown_or_asked_twice_is_refused():
     for name in ("fig13", "../up", "", "a b"):
         with pytest.raises(ConfigError, match="allowed: letters"):

@@ -117,7 +117,9 @@ def test_a_run_that_another_process_holds_is_waited_for(tmp_path, monkeypatch):
 
 
 def test_an_environment_of_ones_own_is_found_by_the_workers(tmp_path, monkeypatch):
-    module = "from headway.task import env_spec\n\ncart = env_spec('pendulum')\n"
+    module = (
+        "from headway.task import env_spec\n\ncart = env_spec('pendulum')\nprint('a' * 70_000)\n"
+    )
     (tmp_path / "own_carts.py").write_text(module)
     monkeypatch.syspath_prepend(tmp_path)
     (job,) = comparison(tmp_path, sweep_experiment("own", ["random"], {}), ("own_carts:cart",)).jobs

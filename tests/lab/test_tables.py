@@ -117,6 +117,17 @@ def test_settings_of_an_older_shape_are_read(run_dir):
     assert len(runs.final) == 24
 
 
+def test_settings_that_change_no_number_part_no_seeds(tmp_path):
+    fakes.write(tmp_path / "plain")
+    kept = {"collection.num_checkpoints": 5, "collection.step_timeout_s": 5.0}
+    fakes.write(tmp_path / "kept", seed=1, **kept)
+    fakes.write(tmp_path / "again", seed=1)
+    runs = read_runs([tmp_path])
+    assert {*runs.runs.label} == {"tmcl"}
+    assert len(runs.runs) == 2
+    assert "same settings and seed" in runs.notes[0][1]
+
+
 def test_a_group_score_counts_each_physics_once():
     def row(length, value):
         physics = {"length": length, "mass": 1.0}

@@ -317,6 +317,17 @@ def test_training_goes_on_from_a_fit(fitted):
         headway.train("hopper", from_run=fitted.path)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("planner.horizon", 9), ("collection.num_iterations", 2)],
+)
+def test_what_cannot_go_on_from_a_fit_is_refused_before_it_is_copied(fitted, tmp_path, name, value):
+    given = {"run_dir": tmp_path / "on", "settings": {name: value}}
+    with pytest.raises(ConfigError, match=f"{name} cannot be so, allowed: the settings of"):
+        headway.train("pendulum", from_run=fitted.path, **given)
+    assert not (tmp_path / "on").exists()
+
+
 def test_what_is_exported_is_read_back(reference, tmp_path):
     count = export_data(reference, tmp_path / "pendulum-v0")
     data = RunDir(reference).load_data()

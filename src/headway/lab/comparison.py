@@ -92,10 +92,11 @@ def reproduce(
         UnknownNameError: No such environment, method or preset.
         ConfigError: A setting is unknown, of the wrong type or out of range.
     """
+    folder = comparison.folder  # whose files are read, and may be damaged
     failures = run_jobs(comparison.jobs, workers or Workers(), quiet=quiet)
     found = find(comparison)
-    write_json(comparison.folder / NOTE, comparison.facts)
-    path = comparison.folder / f"{comparison.experiment.name}.csv"
+    write_json(folder / NOTE, comparison.facts)
+    path = folder / f"{comparison.experiment.name}.csv"
     raw = found.episodes.rename(columns={"label": "arm"})
     raw["run"] = [Path(run).relative_to(comparison.out).as_posix() for run in raw["run"]]
     raw["experiment"] = comparison.experiment.name
@@ -204,7 +205,7 @@ def table(found: Found, env: str) -> list[list[str]]:
             is_trained = own.group == tables.TRAIN
             trained = own[is_trained].groupby("run").return_mean.mean()
             unseen = own[~is_trained].groupby("run").filter(lambda run: run.score.notna().all())
-            score = unseen.groupby(["run", "group"]).score.mean().groupby("run").mean().mean()
+            score = unseen.groupby("run").score.mean().mean()
             lines[-1] += [spread(trained), NONE if pd.isna(score) else f"{score:.2f}"]
     return lines
 

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from headway.errors import ConfigError, UnknownNameError, check_names, shown
+from headway.lab.tables import REFERENCES
 from headway.training.methods import METHODS, NO_CONTEXT
 
 Settings = Mapping[str, Any]
@@ -57,6 +58,7 @@ class Experiment:
 
 
 _METHODS = tuple(Arm(name, name) for name in METHODS)
+_LEARNING = tuple(arm for arm in _METHODS if arm.method not in REFERENCES)
 _AVERAGE = {"planner.head_selection": "average"}
 # The preset `released-code` would skip the only transition.
 _ONLY_NEWEST = {"planner.selection_length": 1, "planner.selection_skips_newest": False}
@@ -68,7 +70,7 @@ def _values(letter: str, setting: str, *values: int) -> tuple[Arm, ...]:
 
 _EXPERIMENTS = (
     Experiment("comparison", "every method on unseen physics", _METHODS),
-    Experiment("fig9", "every method while learning", _METHODS, measure="collected"),
+    Experiment("fig9", "every method while learning", _LEARNING, measure="collected"),
     Experiment(
         "fig10",
         "PETS with one head and with several",

@@ -348,9 +348,11 @@ def child() -> None:
         os.read(0, 1)
         os.kill(os.getpid(), signal.SIGTERM)
 
+    said = os.dup(1)
+    os.dup2(2, 1)  # what an environment prints says nothing of the run
     config, path, quiet = json.loads(sys.stdin.readline())
     threading.Thread(target=end_with_parent, daemon=True).start()
-    print(json.dumps(make_run(config, path, quiet)))
+    os.write(said, json.dumps(make_run(config, path, quiet)).encode())
 
 
 @contextlib.contextmanager

@@ -18,7 +18,7 @@ import pandas as pd
 from rich import box
 from rich.table import Column, Table
 
-from headway.config import Config, flatten
+from headway.config import TOLERANCE, Config, flatten
 from headway.errors import RunError
 from headway.task import env_names, env_spec
 from headway.training.methods import METHODS
@@ -43,10 +43,7 @@ _FILES: dict[str, tuple[str, str, dict[str, type]]] = {  # by table: file, loss 
     }),
 }  # fmt: skip
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError)
-_NO_VARIANT = (
-    *("env", "method", "preset", "seed", "log", "log.rounds", "log.sha256"),
-    "collection.max_bad_episodes",
-)
+_NO_VARIANT = ("env", "method", "preset", "seed", "log", "log.rounds", "log.sha256", *TOLERANCE)
 _LONG_LABEL = 60  # letters
 MOST_RECORDINGS = 40  # lines
 
@@ -116,7 +113,7 @@ def read_runs(paths: Iterable[str | Path]) -> Runs:
     read.sort(key=operator.itemgetter("env", "order", "method", "seed"))
     kept: dict[str, dict[str, Any]] = {}
     for run in read:
-        name = json.dumps({k: v for k, v in run["settings"].items() if k != _NO_VARIANT[-1]})
+        name = json.dumps({k: v for k, v in run["settings"].items() if k not in TOLERANCE})
         first = kept.setdefault(name, run)
         if first is not run:
             notes.append((run["run"], f"left out: same settings and seed as {first['run']}."))

@@ -22,10 +22,10 @@ from headway.training.check import compared, refuse_faults
 from headway.training.collect import Batches, Episode, Rollout, agent_policy, random_policy
 from headway.training.environments import Environments
 from headway.training.evaluate import Tests, iteration_keys, run_tests
-from headway.training.files import new_folder, reading, tree_arrays, tree_from_arrays, write_bytes
+from headway.training.files import new_folder, tree_arrays, tree_from_arrays, write_bytes
 from headway.training.progress import Progress
 from headway.training.recordings import HELD_OUT, Log
-from headway.training.run import LOCK, RunDir
+from headway.training.run import RunDir
 from headway.training.stopping import StopRequest, stop_requests
 from headway.training.trainers import make_trainer
 
@@ -115,13 +115,10 @@ def continued(run_dir: str | Path) -> Config:
 def copy_run(run_dir: Path, to: Path) -> None:
     """Copy a run, to go on with the copy; where there is something already, that is kept."""
     if not to.exists():
-        names = {path.relative_to(run_dir) for path in run_dir.rglob("*") if path.is_file()}
+        files = RunDir(run_dir).files(data=True)
         with new_folder(to) as folder:
-            for name in sorted(names):
-                if name.parts[0] not in ("partial", "figures", LOCK):
-                    with reading(run_dir / name):
-                        content = (run_dir / name).read_bytes()
-                    write_bytes(folder / name, content)
+            for name, content in files.items():
+                write_bytes(folder / name, content)
 
 
 @dataclasses.dataclass
