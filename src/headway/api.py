@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from headway.config import TOLERANCE, Config, override
+from headway.config import Config
 from headway.errors import ConfigError
 from headway.models.compilation import prepare_jax
 from headway.planning.controller import Controller
@@ -122,17 +122,10 @@ def train(  # noqa: PLR0913 (keywords, all with a default)
         config = make_config(env, method=method, preset=preset, seed=seed, settings=settings)
         path = Path(run_dir or _usual_dir(config))
     else:
-        usual = continued(from_run)
-        config = override(usual, settings or {})
+        config = continued(from_run, settings)
         path = Path(run_dir or f"{Path(from_run)}-on")
         if env_spec(env).name != config.env:
             raise ConfigError(f"env is {env!r}, allowed: {config.env!r}, that of {from_run}.")
-        changed = {*(settings or {})} - {*TOLERANCE, "collection.num_iterations"}
-        if changed or config.collection.num_iterations <= usual.collection.num_iterations // 2:
-            raise ConfigError(
-                f"{', '.join(sorted(changed)) or 'collection.num_iterations'} cannot be so,"
-                f" allowed: the settings of {from_run}, and more iterations than it has."
-            )
         copy_run(Path(from_run), path)
     options = {"on_iteration": on_iteration, "resume_from_last_good": resume_from_last_good}
     return _run(config, path, progress, **options)

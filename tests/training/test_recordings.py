@@ -318,12 +318,19 @@ def test_training_goes_on_from_a_fit(fitted):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [("planner.horizon", 9), ("collection.num_iterations", 2)],
+    ("name", "value", "said"),
+    [
+        ("planner.horizon", 9, "changed is planner.horizon: . -> 9"),
+        ("collection.num_iterations", 2, "num_iterations is 2 and changed is nothing"),
+        ("collection.num_iterations", 1, "changed is collection.num_iterations: 2 -> 1"),
+    ],
 )
-def test_what_cannot_go_on_from_a_fit_is_refused_before_it_is_copied(fitted, tmp_path, name, value):
+def test_what_cannot_go_on_from_a_fit_is_refused_before_it_is_copied(
+    fitted, tmp_path, name, value, said
+):
     given = {"run_dir": tmp_path / "on", "settings": {name: value}}
-    with pytest.raises(ConfigError, match=f"{name} cannot be so, allowed: the settings of"):
+    allowed = "allowed: more iterations than 2, and the settings of"
+    with pytest.raises(ConfigError, match=f"{said}, {allowed}"):
         headway.train("pendulum", from_run=fitted.path, **given)
     assert not (tmp_path / "on").exists()
 

@@ -13,8 +13,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from headway.errors import ConfigError, UnknownNameError, check_names, shown
-from headway.lab.tables import REFERENCES
-from headway.training.methods import METHODS, NO_CONTEXT
+from headway.training.methods import METHODS, NO_CONTEXT, REFERENCES
 
 Settings = Mapping[str, Any]
 Measure = Literal["unseen", "collected"]

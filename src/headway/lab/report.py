@@ -25,6 +25,7 @@ from headway.errors import ConfigError, HeadwayError
 from headway.lab import diagnose, episode, figures, statistics, tables
 from headway.lab.tables import COLLECTED, PHASES, TRAIN, group_label
 from headway.training.files import check_target, write_bytes
+from headway.training.methods import REFERENCES
 
 FILMS = {".gif": "image/gif", ".mp4": "video/mp4"}
 ROOM = 16  # MiB of films on a page
@@ -218,7 +219,7 @@ def _results_of(page: Page, env: str) -> Block:
     references = page.found.runs[page.found.runs.is_reference & (page.found.runs.env == env)]
     text = "Returns: no references are known for all of these physics."
     if env in page.scored:
-        own_runs = set(references.method) == set(tables.REFERENCES)
+        own_runs = set(references.method) == set(REFERENCES)
         by = "the runs of random and true-dynamics given here"
         text = f"Scores are normalised by {by if own_runs else 'the reference returns'}."
     columns = ["method", *map(group_label, _groups(own))]

@@ -21,12 +21,11 @@ from rich.table import Column, Table
 from headway.config import TOLERANCE, Config, flatten
 from headway.errors import RunError
 from headway.task import env_names, env_spec
-from headway.training.methods import METHODS
+from headway.training.methods import METHODS, REFERENCES
 from headway.training.recordings import HELD_OUT, RECORDING
 from headway.training.references import score, score_of
 from headway.training.run import EpisodeRow, RunDir, parse_sim_params
 
-REFERENCES = ("random", "true-dynamics")
 TRAIN, COLLECTED = "train", "collected"
 PHASES = ("collect", "fit", "evaluate")
 SERIES = ["env", "label", "seed", "run"]  # the keys of a run in every table

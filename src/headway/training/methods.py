@@ -166,6 +166,7 @@ _METHODS = (
 )
 
 METHODS: dict[str, Method] = {method.name: method for method in _METHODS}
+REFERENCES = ("random", "true-dynamics")
 
 PAPERS_SEARCH = {"planner.optimizer.narrow_at_bounds": True}
 SMALL_SEARCH = {

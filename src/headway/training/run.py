@@ -196,21 +196,24 @@ class RunDir:
                 "commit": _commit(),
             }
             write_json(self.path / "config.json", values)
-        begun, wanted = tolerating_as(self.config(), config), config.collection.num_iterations
-        if longer := wanted > begun.collection.num_iterations:
-            begun = override(begun, {"collection.num_iterations": wanted})
-        found = differences(begun, config)
-        if found:
+        if found := self.changes(config):
             raise RunError(
                 f"{self.path} holds a run with other settings ({'; '.join(found)}); choose another"
                 " --run-dir, or the same settings to resume, perhaps with more iterations."
             )
-        if longer:
-            self._lengthen(wanted)
+        if config.collection.num_iterations > self.config().collection.num_iterations:
+            self._lengthen(config.collection.num_iterations)
         self.check()
         settings = self.config(), config  # what the run was begun to keep is not deleted later
         self._num_checkpoints = max(each.collection.num_checkpoints for each in settings)
         self._tidy()
+
+    def changes(self, config: Config) -> list[str]:
+        """Return one line per setting that would make it another run; more iterations do not."""
+        begun, wanted = tolerating_as(self.config(), config), config.collection.num_iterations
+        if wanted > begun.collection.num_iterations:
+            begun = override(begun, {"collection.num_iterations": wanted})
+        return differences(begun, config)
 
     def config(self) -> Config:
         """The settings of the run.

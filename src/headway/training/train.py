@@ -3,7 +3,7 @@
 import dataclasses
 import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, nullcontext
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from jaxtyping import PRNGKeyArray
 
 from headway.config import Config, override
 from headway.data import Trajectory
-from headway.errors import DivergenceError
+from headway.errors import ConfigError, DivergenceError
 from headway.models.fitting import EpochStats
 from headway.task import BUILT_IN, episode_length
 from headway.training.check import compared, refuse_faults
@@ -102,18 +102,29 @@ def train_run(
     return run
 
 
-def continued(run_dir: str | Path) -> Config:
-    """The settings of a finished run, for as many iterations again.
+def continued(run_dir: str | Path, settings: Mapping[str, Any] | None = None) -> Config:
+    """The settings of a finished run that goes on, by default for as many iterations again.
 
     Raises:
         RunError: There is no run, or it is not finished.
+        ConfigError: Settings would make it another run, or no longer.
     """
-    config = RunDir(run_dir).finished_config()
-    return override(config, {"collection.num_iterations": 2 * config.collection.num_iterations})
+    run = RunDir(run_dir)
+    begun = run.finished_config().collection.num_iterations
+    twice = {"collection.num_iterations": 2 * begun}
+    config = override(run.config(), {**twice, **(settings or {})})
+    wanted = config.collection.num_iterations
+    if (changed := run.changes(config)) or wanted <= begun:
+        raise ConfigError(
+            f"collection.num_iterations is {wanted} and changed is"
+            f" {'; '.join(changed) or 'nothing'}, allowed: more iterations than {begun}, and the"
+            f" settings of {run_dir}."
+        )
+    return config
 
 
 def copy_run(run_dir: Path, to: Path) -> None:
-    """Copy a run, to go on with the copy; where there is something already, that is kept."""
+    """Copy a run's newest iteration, to go on with it; what there is already is kept."""
     if not to.exists():
         files = RunDir(run_dir).files(data=True)
         with new_folder(to) as folder:
