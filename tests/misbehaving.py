@@ -53,6 +53,10 @@ class Drift(gymnasium.Env):
         }
         return tuple((result | (self.misbehave() or {})).values())
 
+    def render(self):
+        if self.how == "render":
+            self.leave()
+
     def misbehave(self):
         if not self.how or self.elapsed != self.at or self.only not in (None, self.drift):
             return None

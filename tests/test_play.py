@@ -59,12 +59,12 @@ class DimmableLamp(Lamp):
         self.power = values["power"]
 
 
-def lamp(tmp_path, monkeypatch, cls=Lamp):
+def lamp(tmp_path, monkeypatch, cls=Lamp, power=Uniform(1, 2), weak=0.5):  # noqa: B008
     """A run with a lamp that acts at random."""
     monkeypatch.setattr(task, "_registered", dict(task._registered))
-    power = SimParamSets({"power": Uniform(1, 2)}, {"weak": {"power": [0.5]}})
+    sets = SimParamSets({"power": power}, {"weak": {"power": [weak]}})
     own = {"name": "lamp", "env_id": cls, "make_task": PointTask, "episode_length": 6}
-    headway.register(EnvSpec(**own, sim_params=power))
+    headway.register(EnvSpec(**own, sim_params=sets))
     settings = {"collection.check": False, "collection.num_iterations": 1}
     run = headway.train(
         "lamp", method="random", preset="smoke", run_dir=tmp_path / "run", settings=settings
@@ -149,6 +149,30 @@ def test_what_can_be_chosen_is_what_varies(tmp_path, env, expected):
     before = player.obs
     player.push(1.0)
     assert (player.obs != before).any()
+    player.environments.close()
+
+
+def test_a_range_of_whole_numbers_is_an_amount(tmp_path, monkeypatch):
+    player = Player(lamp(tmp_path, monkeypatch, power=Uniform(-2, 2), weak=-3.0))
+    assert player.ranges == {"power": Uniform(-3.0, 2.0)}
+    player.environments.close()
+
+
+def test_heads_that_learn_can_be_stopped_on_the_page_and_learn_again(tmp_path):
+    pytest.importorskip("viser", reason="no viser: pip install 'headway[play]'")
+    settings = {"collection.num_iterations": 1, "planner.change_threshold": 7.0}
+    run = headway.train(
+        "pendulum", method="tmcl-bayes", preset="smoke", run_dir=tmp_path, settings=settings
+    )
+    player = Player(run.path)
+    page = Page(player, "127.0.0.1", 8400)
+    assert page._learn.value
+    for learn, adaptation in ((False, "none"), (True, "last-layer")):
+        page._learn.value = learn
+        page._switch()
+        assert player.controller.agent.planner.adaptation == adaptation
+    assert player.controller.agent.planner.change_threshold == 7.0
+    page.server.stop()
     player.environments.close()
 
 

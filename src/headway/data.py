@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from headway.errors import BadEnvironmentError, ConfigError
+from headway.errors import BadEnvironmentError, ConfigError, shown
+from headway.sim_params import is_finite
 
 Tree = TypeVar("Tree")
 
@@ -69,13 +70,13 @@ def sim_params_row(
     """Simulator parameters in a fixed order.
 
     Raises:
-        ConfigError: A parameter has no value.
+        ConfigError: A parameter has no value, or one that is no finite number.
     """
-    missing = [name for name in names if name not in sim_params]
+    missing = [name for name in names if not is_finite(sim_params.get(name))]
     if missing:
         raise ConfigError(
-            f"sim_params {dict(sim_params)} lack {', '.join(missing)}, allowed: a value for each of"
-            f" {', '.join(names)}, which the model takes as input."
+            f"sim_params {shown(dict(sim_params))} lack {', '.join(missing)}, allowed: a finite"
+            f" number for each of {', '.join(names)}, which the model takes as input."
         )
     return np.array([sim_params[name] for name in names], np.float32)
 

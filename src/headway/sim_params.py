@@ -37,7 +37,7 @@ class Uniform:
     """Its largest value."""
 
     def __post_init__(self) -> None:
-        if not (_is_finite(self.low) and _is_finite(self.high) and self.low < self.high):
+        if not (is_finite(self.low) and is_finite(self.high) and self.low < self.high):
             raise ConfigError(
                 f"Uniform is from {shown(self.low)} to {shown(self.high)}, allowed: finite"
                 " numbers, the lower one first."
@@ -202,7 +202,7 @@ def _checked(where: str, values: Any) -> Values:
             checked[name] = column
             continue
         listed = isinstance(column, list | tuple | range) and column and isinstance(name, str)
-        if not listed or not all(map(_is_finite, column)):
+        if not listed or not all(map(is_finite, column)):
             raise ConfigError(
                 f"sim_params {where}, {str(name)[:80]}, is {shown(column)}, allowed: for a name one"
                 " or more finite numbers, or a range {'low': number, 'high': number}."
@@ -216,7 +216,8 @@ def _checked(where: str, values: Any) -> Values:
     return checked
 
 
-def _is_finite(value: Any) -> bool:
+def is_finite(value: Any) -> bool:
+    """Tell whether a value is one finite number, of Python or NumPy; a truth value is none."""
     if isinstance(value, np.generic):
         value = value.item()
     number = isinstance(value, int | float) and not isinstance(value, bool)

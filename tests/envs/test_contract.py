@@ -1,11 +1,15 @@
 """Promises of every environment."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from env_helpers import NAMES, ROBOTS, actions_of, all_physics, record
 from gymnasium.utils.env_checker import check_env
 
+import headway
 from headway import envs
+from headway import task as tasks
 from headway.errors import BrokenEpisodeError, ConfigError, UnknownNameError
 from headway.sim_params import SimParamSets
 from headway.task import env_spec
@@ -54,6 +58,19 @@ def test_sim_params_are_drawn_from_the_training_values(env, name):
     key = next(iter(allowed[0]))
     own = envs.make(name, sim_params=SimParamSets({key: (3.0,)}))
     assert own.reset(seed=0)[1]["sim_params"][key] == 3.0
+
+
+def test_a_spec_with_other_physics_and_length_is_made_with_them(name, monkeypatch):
+    key = next(iter(env_spec(name).default_sim_params))
+    own = dataclasses.replace(
+        env_spec(name), name="own", sim_params=SimParamSets({key: (3.0,)}), episode_length=2
+    )
+    monkeypatch.setattr(tasks, "_registered", dict(tasks._registered))
+    headway.register(own)
+    env = envs.make("own")
+    assert env.reset(seed=0)[1]["sim_params"][key] == 3.0
+    assert [env.step(env.action_space.sample())[3] for _ in range(2)] == [False, True]
+    env.close()
 
 
 def test_sim_params_can_be_set_in_full_or_in_part_and_leave_the_start_alone(env, name):

@@ -9,6 +9,8 @@ from gymnasium import spaces
 import headway
 import headway.envs
 from headway.envs.physics import MujocoPhysics, adapted
+from headway.envs.vector import SequentialVectorEnv
+from headway.errors import ConfigError
 
 ARRAYS = [name for name in dir(mujoco.MjModel) if name.split("_")[0] in
           ("body", "dof", "geom", "jnt", "actuator", "pair", "tendon", "cam", "light")]  # fmt: skip
@@ -118,8 +120,8 @@ def test_a_joint_that_is_locked_in_an_episode_stays_where_it_is_and_the_others_g
     [
         ({"body:torsoo.mass": 2.0}, "Did you mean 'body:torso.mass'?"),
         ({"fricton": 2.0}, "Did you mean 'friction'?"),
-        ({"friction": -1.0}, "friction is -1.0, allowed: a factor of at least 0"),
-        ({"body:torso.mass": 0.0}, "body:torso.mass is 0, allowed: a factor above 0"),
+        ({"friction": -1.0}, "friction is -1.0, allowed: a finite factor of at least 0"),
+        ({"body:torso.mass": 0.0}, "body:torso.mass is 0.0, allowed: a finite factor above 0"),
         ({"joint:leg_joint.locked": 0.5}, "locked is 0.5, allowed: 0 or 1"),
     ],
 )
@@ -132,6 +134,50 @@ def test_what_the_model_lacks_is_one_line_before_training(values, text, tmp_path
     assert text in str(error.value)
     assert "\n" not in str(error.value)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"gravity": np.nan}, {"gravity": "much"}, {"mass": np.inf}, {"joint:leg_joint.locked": None}],
+)
+def test_physics_that_are_no_finite_number_are_refused_as_they_come(values):
+    env = walker()
+    vector = SequentialVectorEnv([walker])
+    for one in (env, vector):
+        with pytest.raises(ConfigError, match=rf"{next(iter(values))} is .*, allowed: ") as refused:
+            one.reset(options={"sim_params": values})
+        assert "\n" not in str(refused.value)
+
+
+class Fragile(gymnasium.ActionWrapper):
+    """A walker whose simulation breaks when it is pushed to the end."""
+
+    def __init__(self):
+        super().__init__(gymnasium.make("Walker2d-v5"))
+
+    def action(self, action):
+        if action.max() == 1.0:
+            self.unwrapped.data.qvel[:] = 1e20
+        return action
+
+
+def test_a_simulation_that_diverges_ends_its_episode_and_a_try_that_does_pays_nan(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log there
+    vector = SequentialVectorEnv([lambda: MujocoPhysics(Fragile())] * 2)
+    vector.reset(seed=0)
+    calm, wild = np.zeros((3, 6)), np.ones((3, 6))
+    before = vector.envs[0].unwrapped.data.qpos.copy()
+    tried = vector.try_out(0, [calm, wild, calm])
+    assert np.isnan(tried).tolist() == [False, True, False]
+    assert tried[0] == tried[2]
+    np.testing.assert_array_equal(vector.envs[0].unwrapped.data.qpos, before)
+    _, rewards, _, truncated, info = vector.step(np.stack([calm[0], wild[0]]))
+    assert info["broken"] == {1: "the simulation diverged (BADQVEL)"}
+    assert truncated.tolist() == np.isnan(rewards).tolist() == [False, True]
+    assert "broken" not in vector.reset(options={"reset_mask": truncated})[1]
+    assert np.isfinite(vector.step(np.zeros((2, 6)))[1]).all()
 
 
 class WalkerTask(headway.Task):

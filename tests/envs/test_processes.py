@@ -103,6 +103,17 @@ def test_what_is_lost_costs_its_episode_only(how, reason, made, tmp_path):
     assert all(map(gone, last))
 
 
+def test_what_is_lost_while_it_draws_keeps_its_reason(made):
+    vector = made("render", at=-1)
+    vector.reset(seed=0)
+    assert len(vector.render()) == 1  # of the other one
+    for _ in range(2):
+        obs, _, _, truncated, info = vector.step(ONES)
+        assert info["broken"] == {0: "had its process over (3) during render"}
+        assert truncated.tolist() == np.isnan(obs).all(1).tolist() == [True, False]
+    assert "broken" not in vector.reset()[1]
+
+
 def test_a_reset_that_hangs_is_tried_again_in_the_next_episode(made, tmp_path):
     vector = made("hang_in_c", timeout_s=2.0, at=0, mark=str(tmp_path / "once"))
     obs, info = vector.reset(seed=0)

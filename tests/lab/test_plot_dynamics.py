@@ -1,6 +1,10 @@
+import dataclasses
+
 import numpy as np
 
-from headway.lab.dynamics import choose_views, collect_changes
+import headway
+from headway import task
+from headway.lab.dynamics import choose_views, collect_changes, plot_dynamics
 from headway.task import BUILT_IN, env_spec
 
 
@@ -22,6 +26,13 @@ def test_only_the_physics_differ_between_the_changes():
     same = physics.index(physics[0], 1)
     np.testing.assert_allclose(changes[same], changes[0], atol=1e-6)
     assert (np.ptp(changes[1:, :, 2], axis=0) > 0).all()
+
+
+def test_an_environment_may_state_neither_default_physics_nor_a_length(tmp_path, monkeypatch):
+    bare = {"name": "bare", "default_sim_params": {}, "episode_length": 0}
+    monkeypatch.setattr(task, "_registered", dict(task._registered))
+    headway.register(dataclasses.replace(env_spec("pendulum"), **bare))
+    assert plot_dynamics("bare", tmp_path / "bare.png").stat().st_size > 10_000
 
 
 def test_names_of_observations_fit_the_environments():

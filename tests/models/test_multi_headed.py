@@ -137,5 +137,5 @@ def test_episodes_carry_the_parameters_that_a_model_is_told_and_no_others():
     padded = Episodes.pad(trajectories, 3, 5, ("gain",))
     np.testing.assert_array_equal(padded.sim_params, [[0.5], [-2.0], [0.0]])
     assert Episodes.pad(trajectories, 3, 5).sim_params.shape == (3, 0)
-    with pytest.raises(ConfigError, match="lack drag, allowed: a value for each of gain, drag"):
+    with pytest.raises(ConfigError, match="lack drag, allowed: a finite number for each of gain"):
         Episodes.pad(trajectories, 3, 5, NAMES)

@@ -217,8 +217,11 @@ def test_a_controller_that_was_not_told_the_physics_says_what_to_do():
     controller = Controller(told_agent())
     with pytest.raises(ConfigError, match=r"gain, drag.*reset\(sim_params="):
         controller.act(np.zeros(2))
-    with pytest.raises(ConfigError, match="lack drag, allowed: a value for each of gain, drag"):
+    with pytest.raises(ConfigError, match="lack drag, allowed: a finite number for each of gain"):
         controller.reset(sim_params={"gain": 1.0})
+    for wrong in ("slippery", None, float("nan"), [1.0]):
+        with pytest.raises(ConfigError, match="lack drag, allowed: a finite number"):
+            controller.reset(sim_params={"gain": 1.0, "drag": wrong})
     controller.reset(sim_params={"gain": 1.0, "drag": 0.0, "unused": 3.0})
     told = controller.act(np.zeros(2))
     controller.reset()

@@ -19,6 +19,7 @@ from headway.planning.agent import Agent
 from headway.planning.controller import Controller
 from headway.service.export import OUTCOMES, Robot
 from headway.spaces import Spaces
+from headway.training.run import RunDir
 from test_readme import python_blocks
 
 ALONE = """
@@ -83,13 +84,18 @@ def test_the_example_acts_as_the_library_in_a_process_without_it(file, reference
     np.testing.assert_allclose(sent[:100], np.stack(wanted), atol=1e-5)
 
 
-def test_the_file_describes_itself_and_brings_what_jax_reads_it_with(file):
+def test_the_file_describes_itself_and_brings_what_jax_reads_it_with(file, reference):
     with zipfile.ZipFile(file) as archive:
         about = json.loads(archive.read("description.json"))
         for name, digest in about["sha256"].items():
             assert hashlib.sha256(archive.read(name)).hexdigest() == digest
         exported = jax.export.deserialize(bytearray(archive.read("step.bin")))
     assert exported.platforms == ("cpu", "cuda")
+    last = RunDir(reference).metrics()[2]["timesteps"]
+    assert about["run"] == {
+        "env": "pendulum", "method": "tmcl", "preset": "smoke", "seed": 0,
+        "iteration": 2, "timesteps": last,
+    }  # fmt: skip
     assert len(about["state"]) == len(jax.tree.leaves(exported.in_avals)) - 1
     assert (about["action_low"], about["action_high"]) == ([-2.0], [2.0])
     assert about["obs_names"][2] == "angular velocity (rad/s)"
@@ -132,6 +138,12 @@ def test_actions_and_outcomes_are_those_of_a_controller(kind):
             np.testing.assert_array_equal(heads, controller.heads)
     else:
         pytest.fail("the plan never ended")
+    huge = np.float32([3e38, 0.0])  # whose returns are infinite, so that there is no plan
+    state, *_, outcome = step(state, huge)
+    with pytest.raises(PlanningError, match="found a finite return"):
+        controller.act(huge)
+    assert OUTCOMES[int(outcome)] == "none left"
+    assert not robot._unpack(state)[0].acted.any()
     for number in (1.0, np.nan):
         applied = np.full(SPACES[kind].action_shape, number, np.float32)
         controller._correct(applied)

@@ -96,6 +96,20 @@ def test_a_run_that_went_on_is_brought_up_to_date_and_never_set_back(
         assert result(tmp_path / "own") == complete
 
 
+def test_data_that_was_sent_once_is_not_asked_for_later(
+    two_iterations, reference, target, tmp_path
+):
+    shorter = shutil.copytree(two_iterations, tmp_path / "shorter")
+    RunDir(shorter)._lengthen(2)
+    headway.push(shorter, target, data=True)
+    headway.push(reference, target)
+    pulled = RunDir(headway.pull(target, tmp_path / "pulled"))
+    assert pulled.finished_iterations == 3
+    assert not (pulled.path / "data").exists()
+    headway.push(reference, target, data=True)
+    RunDir(headway.pull(target, pulled.path)).check()
+
+
 def refused(error, function, *args):
     with pytest.raises(HeadwayError, match=error) as caught:
         function(*args)

@@ -19,7 +19,7 @@ from gymnasium.spaces import Box
 from jaxtyping import Float
 
 from headway.cpus import num_cpus
-from headway.envs.physics import adapted
+from headway.envs.physics import adapted, divergence
 from headway.envs.vector import HeadwayVectorEnv, ProcessVectorEnv, SequentialVectorEnv, SimParams
 from headway.errors import BrokenEpisodeError, ConfigError
 from headway.sim_params import SimParamSets
@@ -171,9 +171,7 @@ class RobotVectorEnv(WorldVectorEnv):
         self.velocity[active] = after.velocity[active]
         rewards[active] = self.world.reward(before, actions, after)[active]
         for i in active.tolist():  # after huge numbers MuJoCo quietly starts over, but warns
-            counts = self.datas[i].warning.number
-            if counts.any():
-                name = mujoco.mjtWarning(int(np.argmax(counts))).name.removeprefix("mjWARN_")
+            if name := divergence(self.datas[i]):
                 self._broken[i] = f"the simulation of {self.world.spec.name} diverged ({name})"
 
     def _robot_state(self) -> RobotState:
@@ -244,9 +242,7 @@ class RobotVectorEnv(WorldVectorEnv):
         reached = np.concatenate([first, states[:, skip - 1 :: skip]], axis=1)
         qpos, qvel = reached[..., 1 : 1 + nq], reached[..., 1 + nq : 1 + nq + nv]
         after = world.after_step(qpos[:, :-1], qpos[:, 1:], qvel[:, 1:])
-        now = np.full((count, 1), self.velocity[i])
-        velocity = np.concatenate([now, after.velocity[:, :-1]], axis=1)
-        before = RobotState(qpos[:, :-1], qvel[:, :-1], velocity)
+        before = RobotState(qpos[:, :-1], qvel[:, :-1], np.array(np.nan))  # no reward reads it
         return world.reward(before, actions, after).sum(-1)
 
     def frame(self, i: int) -> np.ndarray:
@@ -388,7 +384,10 @@ def make(name: str, **kwargs: Any) -> gymnasium.Env:
         gymnasium.error.Error: Gymnasium does not know the environment's id.
     """
     spec = env_spec(name)
-    return adapted(_maker(spec), None, **{**spec.options, **kwargs})
+    own: dict[str, Any] = {"sim_params": spec.sim_params} if spec.env_id in _WORLDS else {}
+    if isinstance(spec.env_id, str) and spec.episode_length:
+        own["max_episode_steps"] = spec.episode_length
+    return adapted(_maker(spec), None, **{**own, **spec.options, **kwargs})
 
 
 def _maker(spec: EnvSpec) -> Callable[..., gymnasium.Env]:

@@ -11,8 +11,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from headway.errors import ConfigError, shown, unknown_name
-from headway.sim_params import SimParamSets
+from headway.errors import BrokenEpisodeError, ConfigError, shown, unknown_name
+from headway.sim_params import SimParamSets, is_finite
 
 _FIELDS = {
     "mass": ("body", "nbody", "body_mass", "body_inertia"),
@@ -79,6 +79,17 @@ class MujocoPhysics(gymnasium.Wrapper):
         obs, info = self.env.reset(seed=seed, options=options or None)
         return obs, {**info, "sim_params": dict(self._values)}
 
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Make a step.
+
+        Raises:
+            BrokenEpisodeError: The simulation diverged; MuJoCo has quietly begun anew.
+        """
+        found, data = self.env.step(action), getattr(self.unwrapped, "data", None)
+        if data is not None and (name := divergence(data)):  # dm_control looks by itself
+            raise BrokenEpisodeError(f"the simulation diverged ({name})")
+        return found
+
     def set_sim_params(self, values: Mapping[str, float]) -> None:
         """Change some parameters during an episode.
 
@@ -92,12 +103,15 @@ class MujocoPhysics(gymnasium.Wrapper):
             if name not in self._known:
                 parts = [one for one in self._known if not re.search(r":\d+\.", one)]
                 raise unknown_name("sim_param", name, parts)
-            locks = name.endswith("locked")
-            if not (value in (0, 1) if locks else 0 <= value < np.inf or name == "gravity"):
-                allowed = "0 or 1" if locks else "a factor of at least 0"
+            fits, allowed = is_finite(value), "a finite factor"
+            if name.endswith("locked"):
+                fits, allowed = fits and value in (0, 1), "0 or 1"
+            elif name.endswith("mass"):
+                fits, allowed = fits and value > 0, "a finite factor above 0"
+            elif name != "gravity":
+                fits, allowed = fits and value >= 0, "a finite factor of at least 0"
+            if not fits:
                 raise ConfigError(f"sim_param {name} is {shown(value)}, allowed: {allowed}.")
-            if name.endswith("mass") and not value:
-                raise ConfigError(f"sim_param {name} is 0, allowed: a factor above 0.")
         return dict(values)
 
     def _set(self, values: dict[str, float]) -> None:
@@ -126,6 +140,18 @@ class MujocoPhysics(gymnasium.Wrapper):
         for field in (*_DERIVED, *scaled):
             if hasattr(new, field):
                 getattr(self._model, field)[...] = getattr(new, field)
+
+
+def divergence(data: Any) -> str:
+    """Name the numbers that broke a simulation since its reset as MuJoCo does; "" if none did.
+
+    After such numbers it quietly starts over, and only counts them.
+    """
+    import mujoco
+
+    counts, names = data.warning.number, ("BADQPOS", "BADQVEL", "BADQACC")
+    kinds = [getattr(mujoco.mjtWarning, f"mjWARN_{name}").value for name in names]
+    return next((name for name, kind in zip(names, kinds, strict=True) if counts[kind]), "")
 
 
 def find_model(env: gymnasium.Env) -> Any:
@@ -175,7 +201,8 @@ def try_out(env: gymnasium.Env, sequences: Sequence[Any]) -> list[float]:
 
     Args:
         env: The environment, some steps into an episode.
-        sequences: Actions as `env.step` takes them. An episode that terminates earns no more.
+        sequences: Actions as `env.step` takes them. An episode that terminates earns no more; the
+            sum of one that breaks is NaN.
 
     Raises:
         ConfigError: It cannot be copied.
@@ -193,11 +220,14 @@ def try_out(env: gymnasium.Env, sequences: Sequence[Any]) -> list[float]:
     found = []
     for one, actions in zip(tried, sequences, strict=True):
         found.append(0.0)
-        for action in actions:
-            _, reward, terminated, _, _ = one.step(action)
-            found[-1] += float(reward)
-            if terminated:
-                break
+        try:
+            for action in actions:
+                _, reward, terminated, _, _ = one.step(action)
+                found[-1] += float(reward)
+                if terminated:
+                    break
+        except BrokenEpisodeError:
+            found[-1] = np.nan
         if model is not None:
             import mujoco
 

@@ -33,7 +33,7 @@ from headway.errors import (
     one_line,
     shown,
 )
-from headway.sim_params import SimParamSets
+from headway.sim_params import SimParamSets, is_finite
 from headway.spaces import Spaces
 
 SimParams = dict[str, float]
@@ -344,6 +344,9 @@ class SequentialVectorEnv(HeadwayVectorEnv):
     def _check_sim_params(self, values: dict[str, Any]) -> SimParams:
         if self._sets is not None:
             check_names("sim_param", values, self._sets.names)
+        for name, value in values.items():
+            if not is_finite(value):
+                raise ConfigError(f"sim_param {name} is {shown(value)}, allowed: a finite number.")
         return values
 
     def _begin(self, seeds: Mapping[int, int | None], requested: Sequence[SimParams]) -> None:
@@ -403,7 +406,9 @@ class SequentialVectorEnv(HeadwayVectorEnv):
 
     def render(self) -> tuple[Any, ...]:
         """Draw all that do not break meanwhile, as they were told when they were made."""
-        return tuple(self._call("render", dict.fromkeys(range(self.num_envs), ())).values())
+        frames = self._call("render", dict.fromkeys(range(self.num_envs), ()))
+        self._ends[1, list(self._broken)] = True
+        return tuple(frames.values())
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the environments."""

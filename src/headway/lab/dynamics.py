@@ -16,12 +16,16 @@ from headway.lab.tables import Physics, full_label, varying
 from headway.task import EnvSpec, env_spec
 from headway.training.files import check_target
 
+LONGEST = 1000
+"""Steps of a trajectory in an environment that states no length of its episodes."""
+
 
 def plot_dynamics(env: str, out: str | Path) -> Path:
     """Draw what a trajectory's actions lead to under each training physics.
 
-    A trajectory of random actions is collected in the default environment; in each of its
-    states, the same action is applied under every training physics.
+    A trajectory of random actions is collected under the default physics, or the first of training
+    where there are none; in each of its states, the same action is applied under every training
+    physics.
 
     Args:
         env: Short name or id of an environment.
@@ -36,7 +40,8 @@ def plot_dynamics(env: str, out: str | Path) -> Path:
     """
     check_target(Path(out))
     spec = env_spec(env)
-    physics = [dict(spec.default_sim_params), *spec.sim_params.group("train")]
+    train = spec.sim_params.group("train")
+    physics = [train[0] | dict(spec.default_sim_params), *train]
     changes = collect_changes(spec, physics, num_states=100, seed=0)
     default, varied = changes[0], changes[1:]
     first, second = choose_views(varied)
@@ -96,9 +101,9 @@ def collect_changes(
         world.action_space.seed(seed)
         world.reset(seed=seed, options={"sim_params": dict(physics[0])})
         trajectory = []
-        for _ in range(spec.episode_length):
+        for _ in range(spec.episode_length or LONGEST):
             trajectory.append((world.get_state(), world.action_space.sample()))
-            if world.step(trajectory[-1][1])[2]:
+            if any(world.step(trajectory[-1][1])[2:4]):
                 break
         steps = np.linspace(0, len(trajectory) - 1, min(num_states, len(trajectory)), dtype=int)
         changes = []

@@ -115,11 +115,12 @@ class Page:
         self._entry.on_update(lambda _: player.ask(self._draw_plots))
         self._motion = self._plot("real", "predicted a step before, and planned")
         self._paid, self._taken = self._plot("reward"), self._plot("planning (ms)")
+        self._learned = config.planner.adaptation != "none"  # in the run itself
         with gui.add_folder("Planner", expand_by_default=False):
             self._optimizer = gui.add_dropdown(
                 "search", tuple(OPTIMIZERS), initial_value=config.planner.optimizer.name
             )
-            self._learn = gui.add_checkbox("heads keep learning", False)
+            self._learn = gui.add_checkbox("heads keep learning", self._learned)
             self._learn.visible = config.model.kind == "multi-headed"
             for control in (self._optimizer, self._learn):
                 control.on_update(lambda _: player.ask(self._switch))
@@ -150,8 +151,10 @@ class Page:
 
     def _switch(self) -> None:
         self._status.content = "Compiling the plan …"
-        settings = {"planner.optimizer.name": self._optimizer.value}
-        self.player.switch(settings | (KEEP_LEARNING if self._learn.value else {}))
+        settings: dict[str, Any] = {"planner.optimizer.name": self._optimizer.value}
+        if self._learn.value != self._learned:
+            settings |= KEEP_LEARNING if self._learn.value else {"planner.adaptation": "none"}
+        self.player.switch(settings)
 
     def _plot(self, *names: str) -> Any:
         """A plot of lines over the last steps, in seconds from now."""

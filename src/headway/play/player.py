@@ -92,11 +92,13 @@ class Player:
         amounts, which go from the least to the largest of training and unseen values.
         """
         physics = [row for group in self._sets.group_names for row in self._sets.group(group)]
+        groups = (self._sets.train, *self._sets.unseen.values())
         signed, found = getattr(getattr(self.env, "world", None), "signed", ()), {}
         for name, usual in self._usual.items():
             values = {float(usual)} | ({-1.0, 1.0} if name in signed else set())
             values |= {row[name] for row in physics if name in row}
-            kinds = min(values) <= 0 and all(value.is_integer() for value in values)
+            whole = not any(isinstance(group.get(name), Uniform) for group in groups)
+            kinds = whole and min(values) <= 0 and all(value.is_integer() for value in values)
             if len(values) > 1:
                 ends = Uniform(min(values), max(values))
                 found[name] = tuple(sorted(values)) if kinds else ends

@@ -80,11 +80,13 @@ def export(
     ):
         lower = jax.export.export(jax.jit(function), platforms=PLATFORMS, disabled_checks=[LAYOUTS])
         codes[f"{function.__name__}.bin"] = bytes(lower(*args).serialize())
-    run, kept = RunDir(run_dir), ("env", "method", "preset", "seed")
-    config, timesteps = run.config(), run.metrics()[-1]["timesteps"]
+    run = RunDir(run_dir)
+    config, number = run.config(), run.kept_iteration(iteration)
+    origin = {name: getattr(config, name) for name in ("env", "method", "preset", "seed")}
+    origin |= {"iteration": number, "timesteps": run.metrics()[number]["timesteps"]}
     about = {
         "format": FORMAT,
-        "run": {name: getattr(config, name) for name in kept} | {"timesteps": timesteps},
+        "run": origin,
         "versions": {name: version(name) for name in ("headway", "jax", "jaxlib")},
         **dataclasses.asdict(spaces),
         "obs_names": env_spec(config.env).obs_names,
@@ -152,6 +154,7 @@ class Robot:
         after, held = jax.lax.cond(jnp.isfinite(obs).all(), plan, hold)
         outcome = jnp.where(held, jnp.where(left > 0, HELD, NONE_LEFT), PLANNED)
         left = jnp.where(held, jnp.maximum(left - 1, 0), self.agent.planner.horizon - 1)
+        after = after._replace(acted=after.acted & (outcome != NONE_LEFT))  # nothing to be applied
         heads = getattr(after.belief, "heads", jnp.zeros((1, 0), jnp.int32))[0]
         action = self._own_units(after.action[0], outcome == NONE_LEFT)
         return self._pack(after, left), action, heads, outcome

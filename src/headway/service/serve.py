@@ -12,6 +12,7 @@ import logging
 import signal
 import warnings
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
@@ -83,7 +84,9 @@ def serve(  # noqa: PLR0913 (keywords, all with a default)
     with warnings.catch_warnings(action="ignore"):  # all would say the same
         others = [another(seed=seed) for seed in range(1, max_robots)]
     session = partial(_session, [first, *others], silence_s, say)
-    asyncio.run(_listen(session, host, port, partial(_refuse, token), ready))
+    with asyncio.Runner() as runner:
+        runner.get_loop().set_default_executor(ThreadPoolExecutor(max_robots))
+        runner.run(_listen(session, host, port, partial(_refuse, token), ready))
 
 
 async def _listen(session: Any, host: str, port: int, refuse: Any, ready: Say) -> None:
@@ -138,9 +141,9 @@ async def _session(free: list[Controller], silence_s: float, say: Say, robot: An
         await robot.send(json.dumps({"error": reason}))
         await robot.close(1013, reason)
         return
-    controller, name = free.pop(), "{}:{}".format(*robot.remote_address[:2])
+    name = "{}:{}".format(*robot.remote_address[:2])
     say(f"{name} connected")
-    answers, why = 0, "the robot left"
+    controller, answers, why = free.pop(), 0, "the robot left"
     try:
         await asyncio.to_thread(controller.reset)
         while True:

@@ -72,7 +72,7 @@ def pull(source: str | Path, run_dir: str | Path) -> Path:
     with _hub(source, PARTS) as (folder, _):
         run = RunDir(folder)
         run.config()
-        files = run.files(data=(folder / "data").is_dir())
+        files = run.files()
         with contextlib.suppress(OSError):  # one's own note is no part of the run
             files[CARD] = (folder / CARD).read_bytes()
         _copy(run, files, Path(run_dir), str(run_dir))

@@ -391,11 +391,12 @@ class RunDir:
                 found.setdefault(group, []).append(episode)
         return found
 
-    def files(self, *, data: bool) -> dict[str, bytes]:
+    def files(self, *, data: bool | None = None) -> dict[str, bytes]:
         """The files of the newest iteration as they were written, by name, for a copy.
 
         Args:
-            data: Also what was collected; a copy without it cannot be trained further.
+            data: Also what was collected; a copy without it cannot be trained further. None takes
+                it if the newest of it is here.
 
         Raises:
             RunError: One is damaged or gone, or no file that a run has.
@@ -406,7 +407,10 @@ class RunDir:
         for name in names:
             if not _FILE.fullmatch(name):
                 raise RunError(f"{self.path / checksums} names {shown(name)}, no file of a run.")
-        wanted = [name for name in names if data or not name.startswith("data/")]
+        collected = {name for name in names if name.startswith("data/")}
+        if data is None and collected:
+            data = (self.path / max(collected)).exists()
+        wanted = [name for name in names if data or name not in collected]
         return {**self._read(wanted), checksums: (self.path / checksums).read_bytes()}
 
     def save_iteration(
