@@ -233,11 +233,10 @@ class Train(Command):
         from headway.lab import figures, tables
 
         run = api.train(self.env, from_run=self.from_run, **options)
-        rows = run.last_tests
         drawn = [str(path) for path in figures.save_run_figures(run.path)]
         after = f" after {len(run.metrics)} iterations" * run.config.model.learns
         title = f"{run.config.env}, {run.config.method}{after}"
-        tested, table = tables.evaluation(rows, run.config, title)
+        tested, table = tables.evaluation(run.last_tests, run.config, title)
         facts = {
             "run_dir": str(run.path),
             **{name: getattr(run.config, name) for name in RUN_NAMES},
@@ -607,19 +606,16 @@ class _Runs(Command):
 
     def compare(self, experiment: Any, settings: Mapping[str, Any], words: Sequence[str]) -> int:
         """Make the runs that are missing, and print what all of them found."""
+        from headway.lab.comparison import reproduce, states
         from headway.lab.paper import PAPER_ENVS
         from headway.lab.sweep import Comparison, Workers
 
         envs, seeds = self.envs or PAPER_ENVS, read_seeds(self.seeds)
         comparison = Comparison(experiment, envs, seeds, self.preset, self.out, settings)
         if self.dry_run:
-            from headway.lab.comparison import states
-
             entries, table = states(comparison)
             return self.show({"runs": entries}, table)
         from rich.markdown import Markdown
-
-        from headway.lab.comparison import reproduce
 
         done = reproduce(
             comparison,
@@ -798,14 +794,9 @@ def parse(words: Sequence[str]) -> Command:
     told = "Control that keeps making headway when the physics changes."
     config = (tyro.conf.DisallowNone,)
     if not words or words[0] not in COMMANDS:
-        commands: Any = typing.Union[  # noqa: UP007
-            tuple(
-                Annotated[
-                    cls, tyro.conf.subcommand(name, description=f"{cls.__doc__}".split("\n")[0])
-                ]
-                for name, cls in COMMANDS.items()
-            )
-        ]
+        about = {name: f"{cls.__doc__}".split("\n")[0] for name, cls in COMMANDS.items()}
+        made = {name: cls() for name, cls in COMMANDS.items()}
+        commands: Any = tyro.extras.subcommand_type_from_defaults(made, about, prefix_names=False)
         return tyro.cli(commands, args=words, prog="headway", description=told, config=config)
     command, rest = COMMANDS[words[0]], words[1:]
     names, _ = tyro.cli(Names, args=rest, add_help=False, return_unknown_args=True)

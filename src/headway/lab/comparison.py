@@ -130,8 +130,7 @@ def find(comparison: Comparison) -> Found:
     if _is_collected(comparison):
         episodes = runs.collected.assign(sim_params="", score=float("nan"))
     steps = runs.curves[["run", "iteration", "timesteps"]].drop_duplicates()
-    measured = episodes.merge(steps, on=["run", "iteration"])
-    measured = measured.merge(runs.runs[["run", "preset"]], on="run")
+    measured = episodes.merge(steps, on=["run", "iteration"]).assign(preset=comparison.preset)
     episodes = done.merge(measured.drop(columns=["env", "label", "seed"]), on="run")
     return Found(comparison, episodes, missing)
 
@@ -223,10 +222,11 @@ def verdicts(found: Found) -> list[str]:
 
     The last lines name what is left out, and warn of intervals that come from too few seeds.
     """
-    reference = found.comparison.experiment.reference_arm.label
+    experiment = found.comparison.experiment
+    reference = experiment.reference or experiment.arms[0].label
     parts = found.parts[found.parts.group != tables.TRAIN]
     lines, counts, apart = [], [], []
-    for arm in found.comparison.experiment.arms:
+    for arm in experiment.arms:
         if arm.label == reference:
             continue
         both = parts[parts.label.isin([reference, arm.label])]

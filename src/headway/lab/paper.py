@@ -13,10 +13,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from headway.errors import ConfigError, UnknownNameError, check_names, shown
-from headway.training.methods import METHODS, NO_CONTEXT, REFERENCES
-
-Settings = Mapping[str, Any]
-Measure = Literal["unseen", "collected"]
+from headway.training.methods import METHODS, NO_CONTEXT, REFERENCES, Settings
 
 PAPER_ENVS = (
     "cartpole-swingup", "pendulum", "hopper", "slim-humanoid", "half-cheetah", "crippled-ant",
@@ -47,13 +44,8 @@ class Experiment:
     """In the order of the figure."""
     reference: str = ""
     """Label of the arm that the others are compared with; the first one by default."""
-    measure: Measure = "unseen"
+    measure: Literal["unseen", "collected"] = "unseen"
     """Returns on unseen physics, or those of the episodes collected for training."""
-
-    @property
-    def reference_arm(self) -> Arm:
-        """The arm that the others are compared with."""
-        return next((arm for arm in self.arms if arm.label == self.reference), self.arms[0])
 
 
 _METHODS = tuple(Arm(name, name) for name in METHODS)
@@ -148,11 +140,10 @@ def sweep_experiment(
             f" {', '.join(EXPERIMENTS)}."
         )
     arms = []
-    for method in methods:
-        for values in itertools.product(*grid.values()):
-            chosen = dict(zip(grid, values, strict=True))
-            parts = [method, *(f"{n} {v}" for n, v in chosen.items())]
-            arms.append(Arm(", ".join(parts), method, chosen))
+    for method, *values in itertools.product(methods, *grid.values()):
+        chosen = dict(zip(grid, values, strict=True))
+        parts = [method, *(f"{n} {v}" for n, v in chosen.items())]
+        arms.append(Arm(", ".join(parts), method, chosen))
     labels = [arm.label for arm in arms]
     if not labels or len(set(labels)) < len(labels):
         raise ConfigError("a sweep names a method or a value twice, or none; allowed: each once.")

@@ -88,19 +88,16 @@ def improvement(first: Scores, second: Scores) -> Estimate:
     Its p-value is that of a stratified permutation test: runs of both methods change places within
     every environment. SciPy's test has no strata.
     """
-    both = [*(np.asarray(x, float) for x in first), *(np.asarray(y, float) for y in second)]
-    half = len(first)
+    both, half = [*first, *second], len(first)
     found = estimate(both, lambda runs: improvement_share(runs[:half], runs[half:]))
     rng = np.random.default_rng(0)
-    shuffled: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
-    ways = 1
-    for x, y in zip(both[:half], both[half:], strict=True):
+    shuffled, ways = [], 1
+    for x, y in zip(first, second, strict=True):
         pooled = np.concatenate([x, y])
         orders = rng.permuted(np.tile(np.arange(len(pooled)), (NUM_RESAMPLES, 1)), axis=1)
-        shuffled[0].append(pooled[orders[:, : len(x)]])
-        shuffled[1].append(pooled[orders[:, len(x) :]])
+        shuffled.append(np.split(pooled[orders], [len(x)], axis=1))
         ways *= math.comb(len(pooled), len(x))
-    distances = np.abs(improvement_share(*shuffled) - 0.5)
+    distances = np.abs(improvement_share(*zip(*shuffled, strict=True)) - 0.5)
     as_far = (distances >= abs(found.value - 0.5) - 1e-12).sum()
     p_value = (as_far + 1) / (NUM_RESAMPLES + 1)
     return dataclasses.replace(found, p_value=float(p_value), lowest_p=2 / ways)

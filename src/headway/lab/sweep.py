@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import itertools
 import json
 import logging
 import math
@@ -28,10 +29,10 @@ from typing import Any, NamedTuple, Self
 
 from headway.config import Config, differences, flatten, from_dict, to_dict, tolerating_as
 from headway.errors import BusyError, ConfigError, HeadwayError, RunError, one_line
-from headway.lab.paper import Experiment, Settings
+from headway.lab.paper import Experiment
 from headway.task import env_spec
 from headway.training.files import reading
-from headway.training.methods import make_config
+from headway.training.methods import Settings, make_config
 from headway.training.progress import make_progress
 from headway.training.run import RunDir
 from headway.training.stopping import stop_requests
@@ -130,13 +131,11 @@ class Comparison:
             ConfigError: A setting is unknown, of the wrong type or out of range.
         """
         found = {}
-        for seed in self.seeds:
-            for env in self.envs:
-                for arm in self.experiment.arms:
-                    names = {"method": arm.method, "preset": self.preset, "seed": seed}
-                    changes = {**self.settings, **arm.settings}
-                    config = make_config(env, **names, settings=changes)
-                    found[env, arm.label, seed] = Job.of(config, self.out)
+        for seed, env, arm in itertools.product(self.seeds, self.envs, self.experiment.arms):
+            names = {"method": arm.method, "preset": self.preset, "seed": seed}
+            changes = {**self.settings, **arm.settings}
+            config = make_config(env, **names, settings=changes)
+            found[env, arm.label, seed] = Job.of(config, self.out)
         return found
 
     @property

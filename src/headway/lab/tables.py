@@ -277,8 +277,7 @@ def _scores(found: Runs) -> list[float]:
     place = ["method", "env", "protocol", "sim_params"]
     levels = found.final.groupby([*place, "run"])["return"].mean().groupby(place).mean().to_dict()
     scores = []
-    for row in found.episodes[[*place[1:], "return"]].itertuples(index=False, name=None):
-        env, protocol, sim_params, value = row
+    for env, protocol, sim_params, value in found.episodes[[*place[1:], "return"]].to_numpy():
         low, high = (
             levels.get((method, env, protocol, sim_params)) if (env, method) in single else None
             for method in REFERENCES
@@ -432,8 +431,7 @@ def group_label(group: str) -> str:
 
 def distinct(physics: Iterable[Physics]) -> list[dict[str, float]]:
     """Different sets of simulator parameters, in ascending order."""
-    unique = {tuple(sorted(sim_params.items())): dict(sim_params) for sim_params in physics}
-    return [unique[key] for key in sorted(unique)]
+    return [dict(items) for items in sorted({tuple(sorted(one.items())) for one in physics})]
 
 
 def varying(physics: Sequence[Physics]) -> list[str]:

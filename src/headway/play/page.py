@@ -136,11 +136,8 @@ class Page:
             choices = tuple(f"{value:g}" for value in values)
             control = gui.add_dropdown(name, choices, initial_value=f"{now:g}")
 
-        def change(_: Any) -> None:
-            new = {name: float(control.value)}
-            self.player.ask(partial(self.player.set_sim_params, new))
-
-        control.on_update(change)
+        change = self.player.set_sim_params
+        control.on_update(lambda _: self.player.ask(partial(change, {name: float(control.value)})))
 
     def _pause(self) -> None:
         self.player.paused = not self.player.paused
