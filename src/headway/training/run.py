@@ -370,10 +370,7 @@ class RunDir:
         known = self._checksums(self.finished_iterations - 1)  # fits of recordings collect nothing
         found: list[Trajectory] = []
         for name in [_name("data", i) for i in range(finished) if _name("data", i) in known]:
-            self._read([name])
-            arrays, facts = load_arrays(self.path / name)
-            with reading(self.path / name):
-                found += trajectories_from(arrays, facts)
+            found += self._episodes(name)[0]
         return found
 
     def tests(self) -> dict[str, list[Trajectory]]:
@@ -384,12 +381,16 @@ class RunDir:
         """
         name, found = _name("tests", self.last_iteration), {}
         if name in self._checksums(self.last_iteration):
-            self._read([name])
-            arrays, facts = load_arrays(self.path / name)
-            episodes = trajectories_from(arrays, facts)
+            episodes, facts = self._episodes(name)
             for group, episode in zip(facts["groups"], episodes, strict=True):
                 found.setdefault(group, []).append(episode)
         return found
+
+    def _episodes(self, name: str) -> tuple[list[Trajectory], dict[str, Any]]:
+        self._read([name])
+        arrays, facts = load_arrays(self.path / name)
+        with reading(self.path / name):
+            return trajectories_from(arrays, facts), facts
 
     def files(self, *, data: bool | None = None) -> dict[str, bytes]:
         """The files of the newest iteration as they were written, by name, for a copy.
